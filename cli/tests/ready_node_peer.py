@@ -200,6 +200,44 @@ def drive(host, port, sheet):
     print(json.dumps(said), flush=True)
 
 
+def number(host, port, sheet):
+    """python-canopen's LSS master gives the drive a number, then another one by its identity."""
+    import canopen
+
+    network = canopen.Network()
+    network.bus = bus(host, port)
+    network.notifier = can.Notifier(network.bus, network.listeners, 0.01)
+    said, boots = {}, {node: threading.Event() for node in (12, 13)}
+    for node, booted in boots.items():
+        network.subscribe(0x700 + node, lambda _id, data, _stamp, booted=booted: data[0] == 0 and booted.set())
+    # Silence is an answer here, so a short wait finds a busy computer's node nowhere, and a long one takes minutes.
+    for network.lss.RESPONSE_TIMEOUT in (0.15, 0.5, 1.5):
+        found, identity = network.lss.fast_scan()
+        if found:
+            break
+    said["found"], said["identity"] = found, list(identity or [])
+    network.lss.RESPONSE_TIMEOUT = 10.0
+    said["inquired"] = network.lss.inquire_node_id()
+    network.lss.configure_node_id(12)
+    network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+    said["first"] = boots[12].wait(30)
+    node = network.add_node(12, sheet)
+    node.sdo.RESPONSE_TIMEOUT = 10.0
+    said["serial"] = node.sdo[0x1018][4].raw
+    said["selected"] = network.lss.send_switch_state_selective(*identity)
+    network.lss.configure_node_id(13)
+    network.lss.store_configuration()
+    network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+    node.nmt.send_command(0x82)
+    said["second"] = boots[13].wait(30)
+    other = network.add_node(13, sheet)
+    other.sdo.RESPONSE_TIMEOUT = 10.0
+    said["same"] = other.sdo[0x1018][4].raw
+    network.notifier.stop()
+    network.bus.shutdown()
+    print(json.dumps(said), flush=True)
+
+
 def boat(host, port):
     """The nmea2000 package, by canboat's definitions."""
     from nmea2000 import NMEA2000Decoder

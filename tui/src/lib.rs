@@ -5,6 +5,7 @@
 
 mod app;
 mod cut;
+mod editor;
 mod event_text;
 mod keyboard;
 mod model;
@@ -14,6 +15,7 @@ mod plan;
 mod profile;
 mod screen;
 mod source;
+mod stops;
 #[cfg(test)]
 mod tests;
 mod theme;
@@ -32,10 +34,12 @@ use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
 use app::{Flow, Request};
 use cantap_work::interrupt;
+use editor::Edited;
 use keyboard::{Keyboard, Waited};
 use model::{Playing, SourceState};
 use screen::Screen;
 use source::{Shared, lock};
+use stops::Stops;
 
 pub use app::{App, SendEntry, View, parse_entry};
 pub use model::Model;
@@ -159,8 +163,14 @@ fn display(screen: &mut Screen, sources: &mut Vec<Watched>) -> anyhow::Result<()
         if let Some(text) = app.clipboard.take() {
             screen::copy(&text)?;
         }
-        if let Some(request) = app.request.take() {
-            current = follow(request, sources, current)?;
+        match app.request.take() {
+            Some(Request::Edit(path)) => match screen.give_to(|| editor::edit(&path, &stops))? {
+                Edited::Done => app.reload_script(&path, &mut lock(model)),
+                Edited::Failed(reason) => app.message = reason,
+                Edited::Terminated => break,
+            },
+            Some(request) => current = follow(request, sources, current)?,
+            None => {}
         }
     }
     Ok(())
@@ -174,6 +184,8 @@ fn follow(request: Request, sources: &mut Vec<Watched>, current: usize) -> anyho
             sources.push(opened);
             Ok(sources.len() - 1)
         }
+        // The caller has the terminal.
+        Request::Edit(_) => Ok(current),
         Request::Next => {
             if sources.len() == 1 {
                 "there is one source; O opens a trace beside it".clone_into(&mut sources[0].app.message);
@@ -190,38 +202,6 @@ fn follow(request: Request, sources: &mut Vec<Watched>, current: usize) -> anyho
             sources[next].app.message = notice;
             Ok(next)
         }
-    }
-}
-
-/// Whether another program asked this one to stop for a while (SIGTSTP), as a shell's job control does.
-struct Stops {
-    #[cfg(unix)]
-    asked: Arc<std::sync::atomic::AtomicBool>,
-}
-
-impl Stops {
-    #[cfg(unix)]
-    fn watch() -> std::io::Result<Self> {
-        let asked = Arc::default();
-        signal_hook::flag::register(signal_hook::consts::SIGTSTP, Arc::clone(&asked))?;
-        Ok(Self { asked })
-    }
-
-    #[cfg(unix)]
-    fn asked(&self) -> bool {
-        self.asked.swap(false, std::sync::atomic::Ordering::Relaxed)
-    }
-
-    #[cfg(not(unix))]
-    #[expect(clippy::unnecessary_wraps, reason = "it can fail where there are signals")]
-    fn watch() -> std::io::Result<Self> {
-        Ok(Self {})
-    }
-
-    #[cfg(not(unix))]
-    #[expect(clippy::unused_self, reason = "there are no such signals here")]
-    fn asked(&self) -> bool {
-        false
     }
 }
 

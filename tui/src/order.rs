@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use cantap::Frame;
 use cantap::wire::message::{MAX_MODIFIERS, Modifier};
+use cantap_scripts::Script;
 use cantap_signals::Decoder;
 use cantap_work::changing::Changing;
 
@@ -39,6 +40,12 @@ pub enum Order {
     Send(u8, Frame),
     /// Have the device send a frame periodically, in a slot of the channel with this number; `None` ends it.
     SetPeriodic(u8, u8, Option<Repeated>),
+    /// Run a script on the first device.
+    StartScript(Script),
+    /// End the script with this name.
+    StopScript(String),
+    /// A key for the scripts.
+    ScriptKey(char),
     /// Write the send list to a new file.
     WriteList(PathBuf, String),
     /// Playback: faster.

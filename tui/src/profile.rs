@@ -28,6 +28,8 @@ pub struct Profile {
     pub graph: Vec<String>,
     /// Frames to send, as typed on the page Send: `["123#11 100ms"]`.
     pub send: Vec<String>,
+    /// Scripts for the list, files or ready nodes; paths are relative to the profile.
+    pub scripts: Vec<String>,
     /// A file to record to from the start; its path is relative to the profile.
     pub record: Option<String>,
     /// For light backgrounds.

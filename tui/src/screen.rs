@@ -12,8 +12,8 @@ use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
 use ratatui::crossterm::event::{DisableMouseCapture, EnableMouseCapture};
 use ratatui::crossterm::terminal::{
-    BeginSynchronizedUpdate, EndSynchronizedUpdate, EnterAlternateScreen, LeaveAlternateScreen,
-    disable_raw_mode, enable_raw_mode,
+    BeginSynchronizedUpdate, Clear, ClearType, EndSynchronizedUpdate, EnterAlternateScreen,
+    LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
 use ratatui::crossterm::{execute, queue};
 
@@ -91,14 +91,19 @@ impl Screen {
     /// Stops the program until the shell resumes it, with the terminal restored.
     #[cfg(unix)]
     pub fn suspend(&mut self) -> anyhow::Result<()> {
-        use ratatui::crossterm::terminal::{Clear, ClearType};
+        let stop = || signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGTSTP);
+        Ok(self.give_to(stop)??)
+    }
 
+    /// Gives the terminal to another program for a while.
+    pub fn give_to<R>(&mut self, other: impl FnOnce() -> R) -> anyhow::Result<R> {
         give_back();
-        signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGTSTP)?;
+        let result = other();
         take()?;
         // Nothing that was drawn before is there any more.
         self.terminal = Terminal::new(CrosstermBackend::new(self.page.clone()))?;
-        Ok(execute!(std::io::stdout(), Clear(ClearType::All))?)
+        execute!(std::io::stdout(), Clear(ClearType::All))?;
+        Ok(result)
     }
 
     /// Not available on this system.

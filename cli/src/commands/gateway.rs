@@ -1,7 +1,6 @@
 //! `cantap gateway`: the device passes frames on between its two buses; or its rules are tried on a trace.
 
 mod arguments;
-mod counts;
 mod device;
 mod dry;
 

@@ -67,7 +67,7 @@ pub struct Args {
     /// A profile: device, bit rates, databases, filters, view, send list.
     #[arg(short, long, value_name = "FILE")]
     profile: Option<PathBuf>,
-    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record or nodes.
+    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record, nodes or scripts.
     #[arg(long, value_name = "PAGE", value_parser = view)]
     view: Option<View>,
     /// Record to this file from the start.
@@ -98,8 +98,9 @@ pub struct Args {
 
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
-    found
-        .ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send, record or nodes".to_owned())
+    found.ok_or_else(|| {
+        "a page is trace, fixed, signals, graph, statistics, send, record, nodes or scripts".to_owned()
+    })
 }
 
 fn size(text: &str) -> Result<(u16, u16), String> {
@@ -145,6 +146,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     app.sort = profile.sort.unwrap_or(app.sort);
     app.send = send_list(&profile, &model, &mut report);
     app.databases = databases;
+    add_scripts(&mut app, &mut model, &profile, &mut report);
     app.file = name;
     let record = profile.record.as_ref().map(|path| profile.folder.join(path));
     if let Some(path) = args.output.clone().or(record) {
@@ -295,6 +297,17 @@ fn plan(
         None => plan.choose_channels(),
     }
     Ok(plan)
+}
+
+fn add_scripts(app: &mut App, model: &mut Model, profile: &Profile, report: &mut LoadReport) {
+    for text in &profile.scripts {
+        let is_node = text.starts_with(cantap_scripts::library::PREFIX);
+        let name = if is_node { text.clone() } else { profile.folder.join(text).display().to_string() };
+        if let Err(reason) = app.add_script(&name, model) {
+            report.faults.push(format!("script {text}: {reason}"));
+        }
+    }
+    app.selected = 0;
 }
 
 fn send_list(profile: &Profile, model: &Model, report: &mut LoadReport) -> Vec<SendEntry> {

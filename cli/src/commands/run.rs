@@ -13,7 +13,7 @@ use cantap::wire::message::Mode;
 use cantap::{Channel, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::WriteOptions;
-use cantap_scripts::library::{self, ReadyNode};
+use cantap_scripts::library::{self, LibraryError, ReadyNode};
 use cantap_scripts::{Bench, Live, Message, Outcome, Report, Script, TestResult};
 use cantap_trace::clean;
 use cantap_virtual::Options;
@@ -260,13 +260,10 @@ fn print_node(name: &str) -> anyhow::Result<ExitCode> {
 }
 
 fn read(path: &Path) -> anyhow::Result<Script> {
-    if let Some(name) = path.to_str().and_then(|path| path.strip_prefix(library::PREFIX)) {
-        return library::script(name).map_err(|error| usage(error.to_string()));
-    }
-    let bytes = std::fs::read(path).with_context(|| format!("cannot read {}", path.display()))?;
-    let source = String::from_utf8(bytes)
-        .map_err(|_| usage(format!("{} is no script: it is not text in UTF-8", path.display())))?;
-    Ok(Script::new(path.display().to_string(), source))
+    library::read(path).map_err(|error| match error {
+        LibraryError::File { .. } => error.into(),
+        error => usage(error.to_string()),
+    })
 }
 
 /// Prints what a script logs, at once.

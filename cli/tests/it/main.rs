@@ -47,6 +47,7 @@ mod misbehaving_devices;
 mod monitor_keys;
 mod monitor_replug;
 mod monitor_screens;
+mod monitor_scripts;
 mod monitor_sources;
 mod monitor_terminal;
 mod nodes;

@@ -147,6 +147,22 @@ fn python_canopen_moves_the_drive() {
 }
 
 #[test]
+fn python_canopen_gives_the_drive_its_number() {
+    let Some(python) = peers::python_with("can, canopen") else { return };
+    let rig = Rig::new("node:drive?node=255");
+    let sheet = Command::new(CANTAP).args(["run", "--print", "node:drive.eds"]).output().unwrap();
+    std::fs::write(rig.served.folder.path().join("drive.eds"), &sheet.stdout).unwrap();
+    let mut found = rig.ask(&python, "number", &["drive.eds"]);
+    assert_eq!(found["identity"].take()[3], json!(402_255));
+    let expected = json!({
+        "found": true, "identity": null, "inquired": 255, "first": true, "serial": 402_255, "selected": true, "second": true,
+        "same": 402_255,
+    });
+    assert_eq!(found, expected);
+    assert_eq!(troubled(&rig.conversations("canopen")), Vec::<&Value>::new());
+}
+
+#[test]
 fn canboats_definitions_decode_the_boat() {
     let Some(python) = peers::python_with("can, nmea2000") else { return };
     let rig = Rig::new("node:boat");

@@ -227,7 +227,7 @@ impl Simulation {
     /// If it is not in the language; what goes wrong later is in [`Self::errors`].
     pub fn add(&mut self, script: &Script) -> Result<usize, ScriptError> {
         let place = self.nodes.len();
-        self.nodes.push(Node::start_nth(place, script, &self.decoder, self.seed)?);
+        self.nodes.push(Node::start_nth(place, script, &self.decoder, self.seed, Arc::default())?);
         for wire in &mut self.buses {
             wire.nodes.push(Attached::new(wire.own.bitrate_bps));
         }
@@ -412,7 +412,7 @@ impl Simulation {
                 Some(Output::EndRepeat { handle }) => {
                     self.repeats.retain(|repeat| (repeat.node, repeat.handle) != (place, handle));
                 }
-                Some(Output::Log(_) | Output::Test { .. }) | None => {}
+                Some(Output::Log(_) | Output::TestBegan(_) | Output::Test { .. }) | None => {}
             }
         }
         if has_ended {

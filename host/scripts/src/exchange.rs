@@ -45,6 +45,8 @@ pub enum Output {
     EndRepeat { handle: u32 },
     /// A line for the user.
     Log(String),
+    /// A test has begun.
+    TestBegan(String),
     /// A test has ended.
     Test { name: String, outcome: Outcome, began_ns: u64 },
 }

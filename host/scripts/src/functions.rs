@@ -264,6 +264,7 @@ fn verdicts(engine: &mut Engine, runtime: &Rc<Runtime>) {
         move |context: NativeCallContext<'_>, name: &str, steps: Array| -> Result<()> {
             let began_ns = of.now_ns();
             let mut outcome = Outcome::Passed;
+            of.output(Output::TestBegan(name.to_owned()))?;
             for step in steps {
                 let call: FnPtr = step.try_cast().ok_or("a step of a test is a function")?;
                 // The last step tidies up: it runs whatever happened before.

@@ -34,7 +34,7 @@ pub mod twin;
 
 pub use bench::{Bench, Simulation};
 pub use explain::Explained;
-pub use live::{Live, LiveError, LiveRun};
+pub use live::{Live, LiveError, LiveRun, ScriptCounts, ScriptEvent, ScriptThread};
 pub use node::{Script, ScriptError};
 pub use placement::{Placement, Runner, Statement, Target, TimedBy};
 pub use report::{Message, Outcome, Report, TestResult};

@@ -1,6 +1,7 @@
 //! Ready nodes: scripts that come with the program.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use crate::node::Script;
 use crate::sheets;
@@ -43,6 +44,20 @@ pub enum LibraryError {
         /// The name.
         name: String,
     },
+    /// A script's file cannot be read.
+    #[error("cannot read {path}: {reason}")]
+    File {
+        /// The file.
+        path: String,
+        /// Why not.
+        reason: String,
+    },
+    /// A script's file is no text.
+    #[error("{path} is no script: it is not text in UTF-8")]
+    NoText {
+        /// The file.
+        path: String,
+    },
     /// It has no electronic data sheet.
     #[error("there is no sheet of a ready node {name:?}; there are {}", sheets::names())]
     Sheet {
@@ -81,6 +96,23 @@ impl ReadyNode {
     /// What it is: the first line of its script.
     pub fn title(&self) -> &'static str {
         self.source.lines().next().unwrap_or_default().trim_start_matches('/').trim()
+    }
+}
+
+/// A script as users name it: its file, or a ready node with [`PREFIX`].
+///
+/// # Errors
+/// If the file cannot be read, or there is no such node.
+pub fn read(path: &Path) -> Result<Script, LibraryError> {
+    if let Some(name) = path.to_str().and_then(|path| path.strip_prefix(PREFIX)) {
+        return script(name);
+    }
+    let name = path.display().to_string();
+    let bytes = std::fs::read(path)
+        .map_err(|error| LibraryError::File { path: name.clone(), reason: error.to_string() })?;
+    match String::from_utf8(bytes) {
+        Ok(source) => Ok(Script::new(name, source)),
+        Err(_) => Err(LibraryError::NoText { path: name }),
     }
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
@@ -12,8 +13,8 @@ use rhai::{AST, Engine, Scope};
 
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::functions;
-use crate::runtime::{ENDED, Runtime};
-use crate::sandbox::{self, Operations};
+use crate::runtime::Runtime;
+use crate::sandbox::{self, ENDED, Operations};
 
 /// The stack of a script's thread: enough for the deepest calls that it may make, with functions of the bus in between, also without
 /// optimisation.
@@ -131,6 +132,8 @@ pub struct Node {
     /// The error with which it has ended.
     pub error: Option<String>,
     inputs: Wanted,
+    /// Ends it when true, whatever it does.
+    stop: Arc<AtomicBool>,
     /// Frames that were on the bus, of which it does not know yet.
     confirmed: [usize; CHANNELS],
     to: Option<SyncSender<Resume>>,
@@ -145,20 +148,26 @@ impl Node {
         script: &Script,
         decoder: &Arc<Decoder>,
         seed: u64,
+        stop: Arc<AtomicBool>,
     ) -> Result<Self, ScriptError> {
-        Self::start(script, decoder, seed.wrapping_mul(0x9E37_79B9).wrapping_add(number as u64 + 1))
+        Self::start(script, decoder, seed.wrapping_mul(0x9E37_79B9).wrapping_add(number as u64 + 1), stop)
     }
 
     /// Starts its thread; its first turn is at once.
-    fn start(script: &Script, decoder: &Arc<Decoder>, seed: u64) -> Result<Self, ScriptError> {
+    fn start(
+        script: &Script,
+        decoder: &Arc<Decoder>,
+        seed: u64,
+        stop: Arc<AtomicBool>,
+    ) -> Result<Self, ScriptError> {
         let has_tests = !script.tests()?.is_empty();
         let (to, resume) = sync_channel(1);
         let (turn, from) = sync_channel(1);
-        let (own, decoder) = (script.clone(), Arc::clone(decoder));
+        let (own, decoder, stops) = (script.clone(), Arc::clone(decoder), Arc::clone(&stop));
         let thread = std::thread::Builder::new()
             .name(format!("script {}", script.name))
             .stack_size(STACK_BYTES)
-            .spawn(move || run(&own, resume, turn, decoder, seed))
+            .spawn(move || run(&own, resume, turn, decoder, (seed, stops)))
             .map_err(|error| ScriptError::Thread { name: script.name.clone(), reason: error.to_string() })?;
         Ok(Self {
             name: script.name.clone(),
@@ -167,6 +176,7 @@ impl Node {
             has_ended: false,
             error: None,
             inputs: Wanted::default(),
+            stop,
             confirmed: [0; CHANNELS],
             to: Some(to),
             from,
@@ -222,7 +232,8 @@ impl Node {
 
 impl Drop for Node {
     fn drop(&mut self) {
-        // Its wait fails now, which ends it.
+        // Its wait fails now, or its next operation, which ends it.
+        self.stop.store(true, Ordering::Relaxed);
         self.to = None;
         while self.from.recv().is_ok() {}
         if let Some(thread) = self.thread.take() {
@@ -232,8 +243,14 @@ impl Drop for Node {
 }
 
 /// A script's thread.
-fn run(script: &Script, resume: Receiver<Resume>, turn: SyncSender<Turn>, decoder: Arc<Decoder>, seed: u64) {
-    let operations = Operations::default();
+fn run(
+    script: &Script,
+    resume: Receiver<Resume>,
+    turn: SyncSender<Turn>,
+    decoder: Arc<Decoder>,
+    (seed, stop): (u64, Arc<AtomicBool>),
+) {
+    let operations = Operations::until(Arc::clone(&stop));
     let settings = script.settings.clone();
     let runtime = Runtime::new(resume, turn, operations.clone(), decoder, settings, seed);
     let mut engine = sandbox::engine(&operations);
@@ -248,5 +265,6 @@ fn run(script: &Script, resume: Receiver<Resume>, turn: SyncSender<Turn>, decode
         let tail = ast.clone_functions_only().merge(&tail);
         engine.run_ast_with_scope(&mut scope, &tail).map_err(|error| functions::describe(&error))
     });
-    runtime.finish(result.err().filter(|error| error != ENDED));
+    let is_stopped = stop.load(Ordering::Relaxed);
+    runtime.finish(result.err().filter(|error| error != ENDED && !is_stopped));
 }

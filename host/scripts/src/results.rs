@@ -1,6 +1,6 @@
 //! What a run collects for its report.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 
 use cantap_can::{Channel, Frame};
 
@@ -18,6 +18,8 @@ pub struct Results {
     pub report: Report,
     /// Lines that scripts logged, to be taken.
     pub messages: Vec<Message>,
+    /// The test that each script is in.
+    pub tests: BTreeMap<String, String>,
     last: VecDeque<(u64, Channel, Frame)>,
 }
 
@@ -37,7 +39,12 @@ impl Results {
                 self.messages.push(Message { at_ns: now_ns, script: script.to_owned(), text });
                 None
             }
+            Output::TestBegan(name) => {
+                self.tests.insert(script.to_owned(), name);
+                None
+            }
             Output::Test { name, outcome, began_ns } => {
+                self.tests.remove(script);
                 let trace = if outcome == Outcome::Passed { Vec::new() } else { self.trace() };
                 let script = script.to_owned();
                 self.report.tests.push(TestResult {

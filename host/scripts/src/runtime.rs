@@ -14,14 +14,11 @@ use rhai::{Dynamic, EvalAltResult, FnPtr, FuncArgs, Map, NativeCallContext};
 
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
-use crate::sandbox::Operations;
+use crate::sandbox::{ENDED, Operations};
 use crate::script_frame::ScriptFrame;
 use crate::script_result::Result;
 use crate::servers::{Server, Servers};
 use crate::settings::Settings;
-
-/// Ends a script from outside: an error that it cannot catch.
-pub const ENDED: &str = "ended";
 
 /// How many unconfirmed frames a script may have: more are a loop without a wait.
 const MAX_UNCONFIRMED: usize = 4096;
@@ -188,7 +185,7 @@ impl Runtime {
             Output::EndRepeat { handle } => {
                 state.repeated.remove(handle);
             }
-            Output::Log(_) | Output::Test { .. } => {}
+            Output::Log(_) | Output::TestBegan(_) | Output::Test { .. } => {}
         }
         state.outputs.push(output);
         Ok(())

@@ -2,6 +2,8 @@
 
 use std::cell::Cell;
 use std::rc::Rc;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use rhai::Engine;
@@ -24,7 +26,10 @@ const MAX_VARIABLES: usize = 4096;
 
 /// Counts a script's operations, and its time, since its last wait.
 #[derive(Clone, Debug, Default)]
-pub struct Operations(Rc<Cell<Used>>);
+pub struct Operations {
+    used: Rc<Cell<Used>>,
+    stop: Arc<AtomicBool>,
+}
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Used {
@@ -34,24 +39,34 @@ struct Used {
 }
 
 impl Operations {
+    /// Of a script that ends when this becomes true, also in the middle of a computation.
+    pub fn until(stop: Arc<AtomicBool>) -> Self {
+        Self { used: Rc::default(), stop }
+    }
+
     /// The script waits: it may use as many again.
     pub fn reset(&self) {
-        self.0.set(Used::default());
+        self.used.set(Used::default());
     }
 
     /// Counts as so many operations: what a script hands over is kept until it waits. If that is too much, its next operation is its last.
     pub fn spend(&self, cost: usize) {
-        let Used { operations, since } = self.0.get();
-        self.0.set(Used { operations: operations.saturating_add(cost as u64), since });
+        let Used { operations, since } = self.used.get();
+        self.used.set(Used { operations: operations.saturating_add(cost as u64), since });
     }
 
-    /// One more; whether that is too much.
-    fn count(&self) -> bool {
+    /// One more; why the script ends here, if it does.
+    fn count(&self) -> Option<&'static str> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Some(ENDED);
+        }
         self.spend(1);
-        let Used { operations, since } = self.0.get();
+        let Used { operations, since } = self.used.get();
         let since = since.unwrap_or_else(Instant::now);
-        self.0.set(Used { operations, since: Some(since) });
-        operations > MAX_OPERATIONS || (operations.is_multiple_of(8) && since.elapsed() > MAX_TIME)
+        self.used.set(Used { operations, since: Some(since) });
+        let is_too_long =
+            operations > MAX_OPERATIONS || (operations.is_multiple_of(8) && since.elapsed() > MAX_TIME);
+        is_too_long.then_some(TOO_LONG)
     }
 }
 
@@ -67,9 +82,12 @@ pub fn engine(operations: &Operations) -> Engine {
         .set_max_variables(MAX_VARIABLES)
         .disable_symbol("eval");
     let count = operations.clone();
-    engine.on_progress(move |_| count.count().then(|| TOO_LONG.into()));
+    engine.on_progress(move |_| count.count().map(Into::into));
     engine
 }
+
+/// Ends a script from outside: an error that it cannot catch.
+pub const ENDED: &str = "ended";
 
 /// Why a script was ended that did not wait.
 pub const TOO_LONG: &str = "it computed for too long, or logged too much, without waiting; put a wait(\"1ms\") into its loop, or react to frames with on_frame";

@@ -1,11 +1,13 @@
 //! The functions with which scripts answer: servers, and nodes of protocols.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::rc::{Rc, Weak};
 
 use cantap_can::Channel;
 use cantap_protocols::active::transfer::TransferSettings;
 use cantap_protocols::canopen::abort_text;
+use cantap_protocols::canopen::codec::lss::NO_NODE;
 use cantap_protocols::canopen::codec::sdo::abort;
 use cantap_protocols::canopen::eds::Eds;
 use cantap_protocols::devicenet::codec::MAC_IDS;
@@ -14,8 +16,9 @@ use cantap_protocols::serving::canopen::CanOpenServer;
 use cantap_protocols::serving::devicenet::DeviceNetServer;
 use cantap_protocols::serving::iso_tp::IsoTpServer;
 use cantap_protocols::serving::j1939::{J1939Node, NotSent};
+use cantap_protocols::serving::lss::LssSlave;
 use cantap_trace::grammar;
-use rhai::{Blob, Dynamic, Engine, FnPtr, Map};
+use rhai::{Array, Blob, Dynamic, Engine, FnPtr, Map};
 
 use crate::byte_functions::{byte, data_of};
 use crate::runtime::Runtime;
@@ -41,6 +44,7 @@ pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
     diagnostics(engine, runtime);
     j1939(engine, runtime);
     canopen(engine, runtime);
+    lss(engine);
     devicenet(engine, runtime);
 }
 
@@ -121,8 +125,7 @@ fn canopen(engine: &mut Engine, runtime: &Rc<Runtime>) {
     });
     let of = Rc::clone(runtime);
     engine.register_fn("canopen", move |node: i64, sheet: &str| -> Result<CanOpen> {
-        let number = u8::try_from(node).ok().filter(|node| (1..=127).contains(node));
-        let number = number.ok_or_else(|| format!("{node} is no node; those are 1 to 127"))?;
+        let number = node_number(node)?;
         let sheet = Eds::parse(sheet.as_bytes());
         if sheet.objects.is_empty() {
             return Err("the sheet has no objects; give it the text of an EDS file".into());
@@ -151,10 +154,41 @@ fn canopen(engine: &mut Engine, runtime: &Rc<Runtime>) {
         Ok(node.with(|server, _| server.take_pdo(index, &data)))
     });
     engine.register_fn("reset", |node: &mut CanOpen| node.with(|server, _| server.reset()));
+    engine.register_get("node", |node: &mut CanOpen| node.with(|server, _| i64::from(server.node())));
+    engine.register_set("node", |node: &mut CanOpen, number: i64| -> Result<()> {
+        let number = node_number(number)?;
+        node.with(|server, _| server.set_node(number));
+        Ok(())
+    });
     engine.register_get("serves", |node: &mut CanOpen| node.with(|server, _| server.is_serving));
     engine.register_set("serves", |node: &mut CanOpen, serves: bool| {
         node.with(|server, _| server.is_serving = serves);
     });
+}
+
+/// A slave of CANopen's layer setting services.
+#[derive(Clone)]
+struct Lss(Rc<RefCell<LssSlave>>);
+
+fn lss(engine: &mut Engine) {
+    engine.register_type_with_name::<Lss>("Lss");
+    engine.register_fn("lss", |identity: Array, node: i64| -> Result<Lss> {
+        let number = u8::try_from(node).ok().filter(|node| matches!(node, 1..=127 | &NO_NODE));
+        let number =
+            number.ok_or_else(|| format!("{node} is no node; those are 1 to 127, and 255 without one"))?;
+        let part = |value: Dynamic| value.as_int().ok().and_then(|value| u32::try_from(value).ok());
+        let parts: Option<Vec<u32>> = identity.into_iter().map(part).collect();
+        let parts: Option<[u32; 4]> = parts.and_then(|parts| parts.try_into().ok());
+        let parts =
+            parts.ok_or("an identity is [vendor, product, revision, serial number], each of 32 bits")?;
+        Ok(Lss(Rc::new(RefCell::new(LssSlave::new(parts, number)))))
+    });
+    engine.register_fn("take", |slave: &mut Lss, data: Blob| -> Dynamic {
+        let answer = slave.0.borrow_mut().take(&data);
+        answer.map_or(Dynamic::UNIT, |bytes| Dynamic::from_blob(bytes.to_vec()))
+    });
+    engine.register_fn("reset", |slave: &mut Lss| slave.0.borrow_mut().reset());
+    engine.register_get("node", |slave: &mut Lss| i64::from(slave.0.borrow().node()));
 }
 
 fn devicenet(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -166,6 +200,11 @@ fn devicenet(engine: &mut Engine, runtime: &Rc<Runtime>) {
         of.serve_with(Channel::Can1, format!("node {number}"), server)?;
         Ok(())
     });
+}
+
+fn node_number(node: i64) -> Result<u8> {
+    let number = u8::try_from(node).ok().filter(|node| (1..=127).contains(node));
+    number.ok_or_else(|| format!("{node} is no node; those are 1 to 127").into())
 }
 
 impl CanOpen {

@@ -12,13 +12,20 @@ pub const ENDED_BY_SIGNAL: u8 = 130;
 const ECHO: Duration = Duration::from_secs(2);
 
 static HANDLER: OnceLock<()> = OnceLock::new();
-static STATE: Mutex<State> =
-    Mutex::new(State { is_watched: false, request: Request::NONE, unfinished: Vec::new(), last: None });
+static STATE: Mutex<State> = Mutex::new(State {
+    is_watched: false,
+    is_left: false,
+    request: Request::NONE,
+    unfinished: Vec::new(),
+    last: None,
+});
 
 /// What a signal acts on.
 struct State {
     /// Whether the command checks the flag.
     is_watched: bool,
+    /// The terminal is another program's, and so is Ctrl-C.
+    is_left: bool,
     request: Request,
     /// Incomplete files.
     unfinished: Vec<PathBuf>,
@@ -54,6 +61,9 @@ fn handle() -> Result<(), ctrlc::Error> {
     }
     ctrlc::set_handler(|| {
         let mut state = state();
+        if state.is_left {
+            return;
+        }
         if state.request.signal(Instant::now()) || !state.is_watched {
             for path in state.unfinished.drain(..) {
                 let _ = std::fs::remove_file(path);
@@ -77,6 +87,14 @@ pub fn watch() -> Result<(), ctrlc::Error> {
 /// Whether it was pressed.
 pub fn requested() -> bool {
     state().request.first_at.is_some()
+}
+
+/// Does something while signals have no effect here: the terminal is another program's, and Ctrl-C means that one.
+pub fn leave_to<R>(other: impl FnOnce() -> R) -> R {
+    state().is_left = true;
+    let result = other();
+    state().is_left = false;
+    result
 }
 
 /// Registers what a signal that ends the program immediately does first, such as giving the terminal back; [`None`] for nothing.

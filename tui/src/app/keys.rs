@@ -59,12 +59,13 @@ impl App {
         match key.code {
             KeyCode::Char('q') => return Flow::Quit,
             KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
-            KeyCode::Char(digit @ '1'..='8') => self.show(View::ALL[digit as usize - '1' as usize]),
+            KeyCode::Char(digit @ '1'..='9') => self.show(View::ALL[digit as usize - '1' as usize]),
             KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
             KeyCode::BackTab => {
                 self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
             }
             KeyCode::Char(' ') if self.view == View::Send => self.toggle_sending(),
+            KeyCode::Char(' ') if self.view == View::Scripts => self.toggle_script(model),
             KeyCode::Char(' ') if matches!(model.source, SourceState::Playing(_)) => {
                 self.toggle_playback(model);
             }
@@ -159,6 +160,11 @@ impl App {
             (View::Send, KeyCode::Char('g')) => self.toggle_group(),
             (View::Send, KeyCode::Char('x')) => self.ask(PromptKind::Export, ""),
             (View::Send, KeyCode::Char('i')) => self.ask(PromptKind::Import, ""),
+            (View::Scripts, KeyCode::Char('a')) => self.ask(PromptKind::Script, ""),
+            (View::Scripts, KeyCode::Char('e')) => self.edit_script(model),
+            (View::Scripts, KeyCode::Char('d') | KeyCode::Delete) => self.remove_script(model),
+            (View::Scripts, KeyCode::Char('K')) => self.ask_script_key(model),
+            (View::Scripts, code) => self.scroll_scripts(code),
             (_, code) => self.scroll(code),
         }
     }
@@ -253,7 +259,8 @@ impl App {
 
     fn click(&mut self, event: MouseEvent, model: &Model) {
         if event.row == 0 {
-            if let Some(view) = View::at_column(event.column) {
+            let tab = self.tab_columns.iter().find(|(columns, _)| columns.contains(&event.column));
+            if let Some(view) = tab.map(|(_, view)| *view) {
                 self.show(view);
             }
             return;
@@ -266,13 +273,13 @@ impl App {
             return self.click_heading(event.column);
         }
         // A page begins with a heading; that of the send list is below a sentence.
-        let body_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
+        let body_row = BODY_ROW + if matches!(self.view, View::Send | View::Scripts) { 2 } else { 1 };
         let Some(row) = event.row.checked_sub(body_row).map(usize::from).filter(|row| *row < self.page_rows)
         else {
             return;
         };
         match self.view {
-            View::Fixed | View::Signals | View::Send => {
+            View::Fixed | View::Signals | View::Send | View::Scripts => {
                 self.selected = first_row(self.selected, self.page_rows) + row;
             }
             View::Trace => {

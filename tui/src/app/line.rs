@@ -105,6 +105,10 @@ pub enum PromptKind {
     Open,
     /// A file to write the send list to.
     Export,
+    /// A script for the list.
+    Script,
+    /// A key for the scripts.
+    ScriptKey,
     /// A file with entries for the send list.
     Import,
 }

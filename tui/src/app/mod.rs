@@ -11,6 +11,7 @@ mod open;
 mod player;
 mod prompt;
 mod request;
+mod scripts;
 mod scroll;
 mod search;
 mod sending;

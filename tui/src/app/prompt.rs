@@ -18,6 +18,7 @@ impl App {
     pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {
         match (code, &mut self.prompt) {
             (code, Some(Prompt { kind: PromptKind::Normal, .. })) => self.answer_normal(code),
+            (code, Some(Prompt { kind: PromptKind::ScriptKey, .. })) => self.answer_script_key(code),
             (KeyCode::Esc, _) => self.prompt = None,
             (KeyCode::Tab, Some(Prompt { kind: PromptKind::Send, line, .. })) => {
                 let (before, _) = line.halves();
@@ -53,6 +54,7 @@ impl App {
             | PromptKind::Open
             | PromptKind::Export
             | PromptKind::Import
+            | PromptKind::Script
                 if text.is_empty() =>
             {
                 Ok(())
@@ -71,8 +73,9 @@ impl App {
             PromptKind::Import => self.import_list(Path::new(text), model),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
-            // It is answered by one key.
-            PromptKind::Normal => Ok(()),
+            PromptKind::Script => self.add_script(text, model),
+            // They are answered by one key.
+            PromptKind::Normal | PromptKind::ScriptKey => Ok(()),
         };
         if let Err(reason) = result {
             self.message = reason;

@@ -7,6 +7,8 @@ use std::path::PathBuf;
 pub enum Request {
     /// Open this trace beside what is running.
     Open(PathBuf),
+    /// Have the user edit this script, with the terminal.
+    Edit(PathBuf),
     /// Show the next source.
     Next,
     /// Close this one, unless it is the only one.

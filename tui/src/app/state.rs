@@ -39,11 +39,13 @@ pub enum View {
     Record,
     /// Nodes, transfers, and events.
     Nodes,
+    /// Scripts, and the device's gateway.
+    Scripts,
 }
 
 impl View {
     /// In the order of their keys.
-    pub const ALL: [View; 8] = [
+    pub const ALL: [View; 9] = [
         View::Trace,
         View::Fixed,
         View::Signals,
@@ -52,6 +54,7 @@ impl View {
         View::Send,
         View::Record,
         View::Nodes,
+        View::Scripts,
     ];
 
     /// The text of its tab.
@@ -65,16 +68,8 @@ impl View {
             Self::Send => "Send",
             Self::Record => "Record",
             Self::Nodes => "Nodes",
+            Self::Scripts => "Scripts",
         }
-    }
-
-    /// The page whose tab is in this column of the screen's first line.
-    pub fn at_column(column: u16) -> Option<Self> {
-        let mut end = 1;
-        Self::ALL.into_iter().find(|view| {
-            end += view.title().len() as u16 + 3;
-            column < end
-        })
     }
 }
 
@@ -154,6 +149,12 @@ pub struct App {
     pub help_first: usize,
     /// The input line, if any.
     pub prompt: Option<Prompt>,
+    /// Lines of the scripts' output below the last one on the page; a position past the beginning is drawn as the beginning.
+    pub output_above: usize,
+    /// Number of lines of it that fit on the page, as last drawn.
+    pub output_rows: usize,
+    /// The columns of the pages' tabs, as last drawn.
+    pub tab_columns: Vec<(Range<u16>, View)>,
     /// A message to show once, such as an error in what was typed.
     pub message: String,
     /// The message as last drawn is longer than its line, lies over the page, and says that any key continues.
@@ -238,6 +239,9 @@ impl App {
             help: false,
             help_first: 0,
             prompt: None,
+            output_above: 0,
+            output_rows: 20,
+            tab_columns: Vec::new(),
             message: String::new(),
             any_key_continues: false,
             bookmarks: Vec::new(),

@@ -4,6 +4,7 @@
 pub mod fixed;
 pub mod history;
 mod kept;
+pub mod scripts;
 pub mod series;
 pub mod signals;
 mod talk;
@@ -24,6 +25,7 @@ use cantap_work::recording::RecordingState;
 
 pub use fixed::{FixedTable, Row};
 pub use history::{History, While};
+pub use scripts::{LineKind, ScriptState, Scripts};
 pub use series::{Extent, Point, Series};
 pub use signals::{Decoded, SignalRow, SignalTable};
 pub use talk::{Talk, Talked};
@@ -144,6 +146,8 @@ pub struct Model {
     pub unread: Option<(u64, String)>,
     /// The recording, if there is one.
     pub recording: Option<RecordingState>,
+    /// Scripts, and the device's gateway.
+    pub scripts: Scripts,
     /// The latest message for the user.
     pub notice: String,
     talk: Talk,
@@ -176,6 +180,7 @@ impl Model {
             reception: Reception::default(),
             unread: None,
             recording: None,
+            scripts: Scripts::default(),
             notice: String::new(),
             talk: Talk::default(),
             options,
@@ -231,6 +236,7 @@ impl Model {
         self.seen.table = FixedTable::default();
         self.seen.signals.clear();
         (self.talk, self.seen.talked) = (Talk::default(), Talked::default());
+        self.scripts.output.clear();
         self.seen.taken = 0;
         self.first_ns = None;
         self.begin_statistics();

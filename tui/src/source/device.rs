@@ -12,8 +12,9 @@ use cantap::{Channel, TraceEvent, TraceRecord};
 use super::super::model::{DeviceFigures, SourceState};
 use super::super::order::{Order, Repeated};
 use super::super::plan::Plan;
+use super::scripts::BOARD;
 use super::timed::{Ended, Timed};
-use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
+use super::{FIGURES_EVERY, SCRIPTS_WAIT, Source, Then, WAIT, lock};
 use cantap_work::advice;
 use cantap_work::bus_hints::BusHint;
 use cantap_work::channels::place_of;
@@ -54,6 +55,8 @@ impl Source<'_> {
             for (count, line) in reconnects.iter_mut().zip(lines.lines()) {
                 *count += line.gaps().count;
             }
+            let board = lines.lines().nth(BOARD).and_then(Line::device);
+            self.forget_scripts(board, "its session with the device is over");
             if lines.devices().next().is_some() {
                 self.end(&mut lines);
                 if !matches!(then, Then::Quit) {
@@ -96,13 +99,17 @@ impl Source<'_> {
         self.timed = Timed::default();
         lock(self.model).source = SourceState::Starting;
         loop {
-            match lines.next(WAIT) {
+            let wait = if self.scripts.are_running() { SCRIPTS_WAIT } else { WAIT };
+            match lines.next(wait) {
                 (_, Happening::Records(batch)) => self.hand_over(batch, lines),
                 (board, Happening::Gone(error)) => {
                     unknown[board] = false;
                     self.timed.forget(board);
-                    let mut model = lock(self.model);
                     let reason = advice::sentence(&error);
+                    if board == BOARD {
+                        self.forget_scripts(None, &reason);
+                    }
+                    let mut model = lock(self.model);
                     if lines.devices().next().is_none() {
                         model.source = SourceState::Gone(reason);
                     } else {
@@ -135,8 +142,15 @@ impl Source<'_> {
                     model.refused.push((number, slot));
                 }
             }
+            let scripts_on = lines.lines().nth(BOARD).and_then(Line::device);
+            if let Some(device) = scripts_on {
+                self.serve_scripts(device);
+            }
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;
+                if let Some(device) = scripts_on {
+                    self.show_gateway(device);
+                }
                 self.show_figures(lines, &clock, &mut paces);
                 self.show_recording();
             }
@@ -144,7 +158,12 @@ impl Source<'_> {
                 let is_known = !unknown.contains(&true);
                 let waited = if is_known { early.pop_front() } else { None };
                 let followed = match waited.map_or_else(|| self.orders.try_recv(), Ok) {
-                    Ok(order @ (Order::Send(..) | Order::SetPeriodic(..))) if !is_known => {
+                    Ok(
+                        order @ (Order::Send(..)
+                        | Order::SetPeriodic(..)
+                        | Order::StartScript(_)
+                        | Order::StopScript(_)),
+                    ) if !is_known => {
                         early.push_back(order);
                         Then::GoOn
                     }
@@ -277,6 +296,27 @@ impl Source<'_> {
             self.recover(lines);
             return Then::GoOn;
         }
+        let scripts_on = lines.lines().nth(BOARD).and_then(Line::device);
+        let order = match (order, scripts_on) {
+            (Order::StartScript(script), Some(device)) => {
+                self.start_script(device, script);
+                return Then::GoOn;
+            }
+            (Order::StartScript(script), None) => {
+                let reason = "its device is gone; start it when it is back";
+                lock(self.model).scripts.fail(&script.name, reason);
+                return Then::GoOn;
+            }
+            (Order::StopScript(name), _) => {
+                self.stop_script(&name);
+                return Then::GoOn;
+            }
+            (Order::ScriptKey(key), _) => {
+                self.scripts.key(key);
+                return Then::GoOn;
+            }
+            (order, _) => order,
+        };
         let (Order::Send(number, _) | Order::SetPeriodic(number, ..)) = order else {
             return self.follow(order);
         };
@@ -284,6 +324,7 @@ impl Source<'_> {
         let Some(device) = lines.lines().nth(board).and_then(Line::device) else { return self.follow(order) };
         match order {
             Order::Send(_, frame) => {
+                // The scripts' tags begin above this one.
                 let frame = TxFrame { tag: 0, frame, at_ticks: None };
                 if let Err(error) = device.send(channel, &[frame]) {
                     self.notice(advice::explained(&error));
@@ -294,8 +335,20 @@ impl Source<'_> {
                 if self.timed.set(number, slot, repeated.as_ref()) {
                     return Then::GoOn;
                 }
+                if board == BOARD && repeated.is_none() {
+                    self.scripts.release(channel, slot);
+                } else if board == BOARD && !self.scripts.claim(channel, slot) {
+                    let mut model = lock(self.model);
+                    "the scripts have the device's remaining entries; stop one of them, or of the list"
+                        .clone_into(&mut model.notice);
+                    model.refused.push((number, slot));
+                    return Then::GoOn;
+                }
                 let entry = repeated.map(|repeated| periodic(device.hello().tick_hz, repeated));
                 if let Err(error) = device.set_periodic(channel, slot, entry) {
+                    if board == BOARD {
+                        self.scripts.release(channel, slot);
+                    }
                     let mut model = lock(self.model);
                     model.notice = advice::explained(&error);
                     model.refused.push((number, slot));
@@ -358,6 +411,7 @@ impl Source<'_> {
             self.keep_up(&mut batch);
             self.take(&batch);
         }
+        self.scripts.take(&batch);
         let mut model = lock(self.model);
         let now = Instant::now();
         model.reception.take(&batch, now);

@@ -6,6 +6,7 @@
 mod autobaud;
 mod device;
 mod playback;
+mod scripts;
 mod timed;
 
 use std::fs::File;
@@ -21,6 +22,7 @@ use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
 use cantap_work::recording::{Older, Recording};
+use scripts::SessionScripts;
 use timed::Timed;
 
 /// The model, shared by the source thread and the display.
@@ -50,12 +52,20 @@ enum Then {
 
 /// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
+/// The same while scripts run: what they want of the device waits no longer.
+const SCRIPTS_WAIT: Duration = Duration::from_millis(1);
 /// How often to ask for the device's state, and to flush a recording.
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 
 /// Runs until [`Order::Quit`].
 pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
-    let mut source = Source { model, orders, recording: None, timed: Timed::default() };
+    let mut source = Source {
+        model,
+        orders,
+        recording: None,
+        timed: Timed::default(),
+        scripts: SessionScripts::default(),
+    };
     match origin {
         Origin::Device(plan) => source.run_device(plan),
         Origin::File(path) => source.run_file(&path),
@@ -68,6 +78,7 @@ struct Source<'a> {
     orders: &'a Receiver<Order>,
     recording: Option<Recording>,
     timed: Timed,
+    scripts: SessionScripts,
 }
 
 impl Source<'_> {
@@ -152,6 +163,12 @@ impl Source<'_> {
                 self.notice("there is no device to send with; open one with D");
                 lock(self.model).refused.push((channel, slot));
             }
+            Order::StartScript(script) => {
+                lock(self.model)
+                    .scripts
+                    .fail(&script.name, "there is no device to run it on; open one with D");
+            }
+            Order::StopScript(_) | Order::ScriptKey(_) => {}
             Order::WriteList(path, text) => self.write_list(&path, &text),
             Order::Recover => self.notice("there is no device to bring back onto a bus"),
             Order::Faster

@@ -21,11 +21,12 @@ use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
 use cantap_formats::{ReadOptions, open_reader};
+use cantap_scripts::{Outcome, ScriptCounts, TestResult};
 use cantap_signals::{Decoder, Source};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::app::{App, Flow, View};
-use super::model::{DeviceFigures, Model, SourceState};
+use super::model::{DeviceFigures, LineKind, Model, ScriptState, Scripts, SourceState};
 use super::order::Order;
 use super::plan::Plan;
 use super::theme::Theme;
@@ -153,6 +154,36 @@ fn app(view: View) -> (App, Receiver<Order>) {
     (App::new(view, theme, Some(plan), sender), receiver)
 }
 
+/// Scripts as they are in the middle of their work.
+fn scripts(scripts: &mut Scripts) {
+    for name in ["node:obd?speed=72", "tester.rhai", "broken.rhai"] {
+        scripts.add(name);
+        scripts.begin(name);
+    }
+    let test = |name: &str, outcome: Outcome, trace: &[&str]| TestResult {
+        script: "tester.rhai".to_owned(),
+        name: name.to_owned(),
+        outcome,
+        began_ns: 0,
+        ended_ns: 10_316_000,
+        trace: trace.iter().map(ToString::to_string).collect(),
+    };
+    scripts.take_test(&test("test_speed", Outcome::Passed, &[]));
+    let frames = ["(1.000104) can0 7DF#02010D", "(1.000389) can0 7E8#03410D48"];
+    scripts.take_test(&test("test_rpm", Outcome::Failed("not so: idle\u{1b}[2J".to_owned()), &frames));
+    scripts.set_state("tester.rhai", ScriptState::Running(Some("test_trouble_codes".to_owned())));
+    scripts.say(LineKind::Log, "1.250000 tester.rhai: two\nlines");
+    scripts.fail("broken.rhai", "there is no signal Sped; line 3");
+    scripts.counts = ScriptCounts { sent: 120, received: 4711, waiting: 2, not_sent: 1, lost: 0 };
+    let gateway = [
+        "Gateway running. 1>2: 4711 received, 4700 sent, 11 dropped; 2>1: 0 received, 0 sent",
+        "from rule                  matched     sent  dropped replaced     lost   failed",
+        "1    100:7FF                    11        0       11        0        0        0",
+        "1    000:000                  4700     4700        0        0        0        0",
+    ];
+    scripts.gateway = gateway.map(str::to_owned).to_vec();
+}
+
 /// A decoder from the text of a signal file.
 fn database(text: &str) -> Arc<Decoder> {
     let folder = tempfile::tempdir().unwrap();
@@ -207,6 +238,9 @@ fn check_page(view: View) {
             ..RecordingState::default()
         });
     }
+    if view == View::Scripts {
+        scripts(&mut model.scripts);
+    }
     for size in SIZES {
         let name = format!("{}-{}x{}", view.title().to_lowercase(), size.0, size.1);
         check(&name, &screen_text(&mut app, &model, size).unwrap());
@@ -252,6 +286,12 @@ fn the_record_page_is_as_agreed() {
 #[test]
 fn the_nodes_page_is_as_agreed() {
     check_page(View::Nodes);
+}
+
+/// A test that failed, a script that ended with an error, a ready node, and a gateway.
+#[test]
+fn the_scripts_page_is_as_agreed() {
+    check_page(View::Scripts);
 }
 
 /// A transfer is shown until it is done, and a fault is visible.

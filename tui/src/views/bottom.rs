@@ -124,6 +124,10 @@ fn question(kind: PromptKind) -> &'static str {
         PromptKind::Device => {
             "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them; a trace opens beside"
         }
+        PromptKind::Script => {
+            "add a script: its file, or a ready node such as node:obd?speed=60 (cantap run --nodes lists them)"
+        }
+        PromptKind::ScriptKey => "the next key goes to the scripts; Esc does not",
         PromptKind::Normal => "acknowledge other nodes' frames, and send on request, on this bus? y or n",
     }
 }
@@ -175,6 +179,7 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",
         View::Nodes => "↑↓ scroll",
+        View::Scripts => "a add  e edit  d remove  Space start/stop  PgUp PgDn output  K key  m mode",
     };
     let playback = match model.source {
         SourceState::Playing(_) => {
@@ -183,7 +188,7 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         _ => "",
     };
     let is_file = !playback.is_empty();
-    let pause = if app.view == View::Send || is_file { "" } else { "  Space pause" };
+    let pause = if matches!(app.view, View::Send | View::Scripts) || is_file { "" } else { "  Space pause" };
     let mut all = format!("h help  q quit  {playback}{keys}{pause}  c clear");
     if all.chars().count() > width {
         let ends = all.match_indices("  ").map(|(at, _)| at);

@@ -11,10 +11,10 @@ use super::super::theme::Theme;
 
 /// Every key; `tests/help.rs` checks these against the keys that are handled.
 pub const KEYS: &[(&str, &str)] = &[
-    ("1 … 8, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
+    ("1 … 9, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
     ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
     ("h ? F1", "this"),
-    ("Space", "stop the display or the file, go on; send: entry on or off"),
+    ("Space", "stop or go on: display, file; send, scripts: entry on or off"),
     ("c  t", "clear; times: relative, delta, time of day (UTC)"),
     ("f", "show only some frames, by candump's filters or a condition"),
     ("/  n  N", "search this page, next, and the other way"),
@@ -30,6 +30,7 @@ pub const KEYS: &[(&str, &str)] = &[
     ("← → PgUp PgDn", "graph: move the cursor or pan; Home is oldest, End follows"),
     ("x  a  s  Esc", "graph: cursors, show all, steps or lines, no cursors"),
     ("a  e  d", "send: add, edit, delete"),
+    ("a  e  d  K", "scripts: add, edit, remove; the next key is for them"),
     ("g  x  i", "send: group on or off, write the list, add a file's"),
     ("m  R", "listen-only or normal; bring a bus-off channel back"),
     ("r", "start or stop recording"),

@@ -7,6 +7,7 @@ pub mod help;
 mod list;
 pub mod nodes;
 pub mod record;
+pub mod scripts;
 pub mod send;
 pub mod signals;
 mod state;
@@ -43,7 +44,8 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         Constraint::Length(1),
     ])
     .areas(area);
-    frame.render_widget(Paragraph::new(cut_line(tabs(app), top.width.into())).style(Theme::bar()), top);
+    let tabs = tabs(app, top.width.into());
+    frame.render_widget(Paragraph::new(cut_line(tabs, top.width.into())).style(Theme::bar()), top);
     state::draw(frame, state, app, model);
     // While the display is paused, the pages show what had been seen then.
     let frozen = app.frozen.take();
@@ -57,6 +59,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         View::Send => send::draw(frame, body, app, seen),
         View::Record => record::draw(frame, body, app, model),
         View::Nodes => nodes::draw(frame, body, app, model, seen),
+        View::Scripts => scripts::draw(frame, body, app, model),
     }
     app.frozen = frozen;
     bottom::draw(frame, body, bottom, app, model);
@@ -95,16 +98,41 @@ fn make_ascii(buffer: &mut Buffer) {
     }
 }
 
-fn tabs(app: &App) -> Line<'static> {
-    let mut spans = vec![Span::raw(" ")];
+/// The pages. Where there is no room for all titles, the longest go, apart from the current page's.
+fn tabs(app: &mut App, width: usize) -> Line<'static> {
+    let (this, all) = app.beside;
+    let beside = if all > 1 { format!("w {this} of {all}") } else { String::new() };
+    let mut titles = View::ALL.map(View::title);
+    let text = |index: usize, titles: &[&str]| {
+        let mark = if View::ALL[index] == app.view { '▸' } else { ' ' };
+        if titles[index].is_empty() {
+            format!("{} ", index + 1)
+        } else {
+            format!("{}{mark}{} ", index + 1, titles[index])
+        }
+    };
+    loop {
+        let tabs = (0..titles.len()).map(|index| text(index, &titles).chars().count()).sum::<usize>();
+        // A blank at the end is not missed.
+        if tabs + beside.len() <= width + usize::from(beside.is_empty()) {
+            break;
+        }
+        let others = (0..titles.len()).filter(|index| View::ALL[*index] != app.view);
+        let longest =
+            others.filter(|index| !titles[*index].is_empty()).max_by_key(|index| titles[*index].len());
+        let Some(longest) = longest else { break };
+        titles[longest] = "";
+    }
+    let (mut spans, mut columns, mut end) = (Vec::new(), Vec::new(), 0);
     for (index, view) in View::ALL.into_iter().enumerate() {
-        let text = format!("{}{}{} ", index + 1, if view == app.view { '▸' } else { ' ' }, view.title());
+        let text = text(index, &titles);
+        let begin = end;
+        end += text.chars().count() as u16;
+        columns.push((begin..end, view));
         let style = if view == app.view { Theme::heading() } else { Style::new() };
         spans.push(Span::styled(text, style));
     }
-    let (this, all) = app.beside;
-    if all > 1 {
-        spans.push(Span::styled(format!("w {this} of {all}"), Theme::heading()));
-    }
+    app.tab_columns = columns;
+    spans.push(Span::styled(beside, Theme::heading()));
     Line::from(spans)
 }

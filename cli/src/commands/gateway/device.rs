@@ -16,7 +16,6 @@ use cantap_work::gateway::{Counts, Named, Rules};
 use cantap_work::interrupt;
 
 use super::arguments::Args;
-use super::counts::AsText;
 use crate::exit;
 use crate::stderr;
 
@@ -258,7 +257,7 @@ impl<'a> Watch<'a> {
             (true, true) => writeln!(out, "{}", self.counts.object(&self.named, self.missed()))?,
             (true, false) => {}
             (false, true) => {
-                self.counts.print(&self.named, &mut out)?;
+                self.counts.table(&self.named).iter().try_for_each(|row| writeln!(out, "{row}"))?;
                 writeln!(out)?;
             }
             (false, false) => writeln!(out, "{}", self.counts.line())?,
@@ -272,7 +271,7 @@ impl<'a> Watch<'a> {
         if self.args.json {
             writeln!(out, "{}", self.counts.object(&self.named, self.missed()))?;
         } else {
-            self.counts.print(&self.named, &mut out)?;
+            self.counts.table(&self.named).iter().try_for_each(|row| writeln!(out, "{row}"))?;
             writeln!(out, "{}", self.counts.line())?;
             for (channel, missed) in (1..).zip(self.missed()).filter(|(_, missed)| *missed > 0) {
                 writeln!(

@@ -1,18 +1,24 @@
 //! Scripts as nodes on a real bus, through a device.
 
+mod events;
+mod port;
 mod repeat;
 mod repeated;
 mod run;
 mod settings;
+mod thread;
+mod thread_port;
 
 use cantap::{Device, TraceRecord};
 
 use crate::node::{Script, ScriptError};
 use crate::report::{Message, Report};
 
+pub use events::{ScriptCounts, ScriptEvent};
 use run::Keys;
 pub use run::LiveRun;
 pub use settings::{Live, LiveError};
+pub use thread::ScriptThread;
 
 impl Live {
     /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the
@@ -41,7 +47,7 @@ impl Live {
             run.add(script)?;
         }
         let keys = keys.map(|next| Box::new(next) as Keys<'_>);
-        let result = run.go(self.duration, on_record, on_message, keys, goes_on);
+        let result = run.go(device.records(), self.duration, on_record, on_message, keys, goes_on);
         let (report, messages) = run.finish();
         messages.into_iter().for_each(on_message);
         result.map(|()| report)

@@ -23,17 +23,18 @@ impl LiveRun<'_> {
         let is_of_device = Statement::Periodic.place(self.target, used.len()).runner == Runner::Device;
         // From the last one down: whoever shares the session takes them from the first one up.
         let free = || {
-            (0..self.device.hello().periodic_slots).rev().find(|slot| is_of_device && !used.contains(slot))
+            let mut slots = (0..self.periodic_slots).rev();
+            slots.find(|slot| is_of_device && !used.contains(slot) && self.port.claim(channel, *slot))
         };
         let slot = known.or_else(free);
         let Some(slot) = slot else {
             self.repeat_from_here((place, handle), channel, frame, period_ns);
             return Ok(());
         };
-        let ticks = u128::from(period_ns) * u128::from(self.device.hello().tick_hz) / 1_000_000_000;
+        let ticks = u128::from(period_ns) * u128::from(self.tick_hz) / 1_000_000_000;
         let period_ticks = u32::try_from(ticks).unwrap_or(u32::MAX).max(1);
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
-        self.device.set_periodic(channel, slot, Some(entry))?;
+        self.port.set_periodic(place, channel, slot, Some(entry))?;
         self.repeated.insert((index, slot), place);
         self.slots.insert((index, place, handle), slot);
         Ok(())
@@ -70,7 +71,7 @@ impl LiveRun<'_> {
             self.slots.keys().filter(|(_, place, handle)| is_meant(*place, *handle)).copied().collect();
         for key in meant {
             if let Some(slot) = self.slots.remove(&key) {
-                self.device.set_periodic(Channel::ALL[key.0], slot, None)?;
+                self.port.set_periodic(key.1, Channel::ALL[key.0], slot, None)?;
             }
         }
         Ok(())

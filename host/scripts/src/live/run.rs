@@ -2,16 +2,19 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
+use cantap::device::Records;
 use cantap::device::Transmission;
-use cantap::transmit::Stream;
+use cantap::wire::Hello;
 use cantap::wire::message::TRIGGER_TAG;
 use cantap::{Device, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
 use cantap_signals::Decoder;
 use cantap_trace::{Direction, TraceFrame};
 
+use super::port::{Direct, Port};
 use super::repeat::Repeat;
 use super::settings::{Live, LiveError};
 use crate::exchange::{Input, Output};
@@ -33,19 +36,25 @@ impl Live {
     /// The same for a caller that has the device's records itself and hands them over between turns, and adds scripts as it likes.
     /// [`Self::duration`] is its business.
     pub fn start<'d>(&self, device: &'d Device) -> LiveRun<'d> {
+        self.start_through(Box::new(Direct::new(device)), device.hello())
+    }
+
+    /// The same through anything that leads to a device.
+    pub(super) fn start_through<'d>(&self, port: Box<dyn Port + 'd>, hello: &Hello) -> LiveRun<'d> {
         LiveRun {
-            device,
+            port,
             decoder: Arc::clone(&self.decoder),
             seed: self.seed,
             nodes: Vec::new(),
-            stream: Stream::new(device),
             under_way: BTreeMap::new(),
             ended: Default::default(),
             repeated: BTreeMap::new(),
             dropped: Vec::new(),
             slots: BTreeMap::new(),
             repeats: Vec::new(),
-            target: Target::of(device.hello()),
+            target: Target::of(hello),
+            periodic_slots: hello.periodic_slots,
+            tick_hz: hello.tick_hz,
             results: Results::default(),
             began: Instant::now(),
             first_ns: None,
@@ -60,12 +69,14 @@ pub type Keys<'a> = Box<dyn FnMut() -> Option<char> + 'a>;
 
 /// Scripts on a device, turn by turn. Its end is the end of everything that they began.
 pub struct LiveRun<'d> {
-    pub(super) device: &'d Device,
+    pub(super) port: Box<dyn Port + 'd>,
     pub(super) target: Target,
+    pub(super) periodic_slots: u8,
+    /// The rate of the device's clock.
+    pub(super) tick_hz: u32,
     decoder: Arc<Decoder>,
     seed: u64,
     nodes: Vec<Node>,
-    stream: Stream<'d>,
     /// Whose frame a tag is, and whether the script waits to see it confirmed.
     under_way: BTreeMap<(usize, u32), (usize, bool)>,
     /// Of each channel, how transmissions ended whose records have not come, in the device's order: a record does not say whose frame it is.
@@ -90,13 +101,13 @@ pub struct LiveRun<'d> {
 impl LiveRun<'_> {
     pub(super) fn go(
         &mut self,
+        mut records: Records,
         duration: Option<Duration>,
         on_record: &mut dyn FnMut(TraceRecord),
         on_message: &mut dyn FnMut(Message),
         mut keys: Option<Keys<'_>>,
         goes_on: &mut dyn FnMut() -> bool,
     ) -> Result<(), LiveError> {
-        let mut records = self.device.records();
         // What came before the run is in the trace, and nothing that its scripts have seen.
         for _ in 0..MOST_BEFORE {
             match records.next_batch(Duration::ZERO)? {
@@ -127,7 +138,12 @@ impl LiveRun<'_> {
     /// # Errors
     /// If it is not in the language; what goes wrong later is in [`Self::errors`].
     pub fn add(&mut self, script: &Script) -> Result<usize, ScriptError> {
-        self.nodes.push(Node::start_nth(self.nodes.len(), script, &self.decoder, self.seed)?);
+        self.add_until(script, Arc::default())
+    }
+
+    /// The same; it ends when `stop` becomes true, also in the middle of a computation.
+    pub(super) fn add_until(&mut self, script: &Script, stop: Arc<AtomicBool>) -> Result<usize, ScriptError> {
+        self.nodes.push(Node::start_nth(self.nodes.len(), script, &self.decoder, self.seed, stop)?);
         Ok(self.nodes.len() - 1)
     }
 
@@ -145,6 +161,21 @@ impl LiveRun<'_> {
     /// Whether a node has ended.
     pub fn has_ended(&self, place: usize) -> bool {
         self.nodes.get(place).is_none_or(|node| node.has_ended)
+    }
+
+    /// The error with which a node has ended.
+    pub(super) fn error_of(&self, place: usize) -> Option<&str> {
+        self.nodes.get(place)?.error.as_deref()
+    }
+
+    /// The test that a node is in.
+    pub(super) fn test_of(&self, place: usize) -> Option<&str> {
+        self.results.tests.get(&self.nodes.get(place)?.name).map(String::as_str)
+    }
+
+    /// Frames of the scripts that were not on the bus yet.
+    pub(super) fn waiting(&self) -> usize {
+        self.under_way.len()
     }
 
     /// Scripts that have ended with an error, and the error.
@@ -189,7 +220,7 @@ impl LiveRun<'_> {
             }
         }
         self.send_repeated()?;
-        self.stream.flush()?;
+        self.port.flush()?;
         self.take_failed()?;
         for (place, channel) in std::mem::take(&mut self.dropped) {
             self.resume(place, Some(Input::NotSent { channel }))?;
@@ -300,11 +331,13 @@ impl LiveRun<'_> {
     }
 
     fn collect_ended(&mut self) -> Result<(), LiveError> {
-        self.stream.wait(Duration::ZERO)?;
-        for ended in self.stream.take_ended() {
-            self.ended[ended.channel.index()].push_back(ended);
-        }
+        self.port.take_ended()?.into_iter().for_each(|ended| self.take_transmission(ended));
         Ok(())
+    }
+
+    /// How a transmission ended; before its record.
+    pub(super) fn take_transmission(&mut self, ended: Transmission) {
+        self.ended[ended.channel.index()].push_back(ended);
     }
 
     /// Passes on how a transmission ended: to the sender as such, to the others as a frame.
@@ -328,7 +361,11 @@ impl LiveRun<'_> {
                 Ok(())
             }
             // Of an earlier run, which had it repeated.
-            (Ok(_), None) if (DEVICE_TAG..TRIGGER_TAG).contains(&tag) => Ok(()),
+            (Ok(_), None)
+                if (DEVICE_TAG..TRIGGER_TAG).contains(&tag) && !self.port.is_of_owner(channel, tag) =>
+            {
+                Ok(())
+            }
             (Ok(frame), _) => self.take_frame(channel, frame),
         }
     }
@@ -372,7 +409,7 @@ impl LiveRun<'_> {
                 Some(Output::EndRepeat { handle }) => {
                     self.end_repeats(|of, own| (of, own) == (place, handle))?;
                 }
-                Some(Output::Log(_) | Output::Test { .. }) | None => {}
+                Some(Output::Log(_) | Output::TestBegan(_) | Output::Test { .. }) | None => {}
             }
         }
         if self.nodes[place].has_ended {
@@ -387,9 +424,8 @@ impl LiveRun<'_> {
         (channel, frame): (Channel, Frame),
         is_awaited: bool,
     ) -> Result<(), LiveError> {
-        let began = Instant::now();
         // A queue that stays full means that nothing leaves, which the report says at the end.
-        let tag = self.stream.push(channel, frame, None, |_| began.elapsed() < Duration::from_secs(1))?;
+        let tag = self.port.push(place, channel, frame)?;
         if let Some(tag) = tag {
             self.under_way.insert((channel.index(), tag), (place, is_awaited));
         } else {
@@ -405,8 +441,7 @@ impl LiveRun<'_> {
     /// And returns how it went, and what was logged last.
     pub fn finish(mut self) -> (Report, Vec<Message>) {
         let _ = self.end_repeats(|_, _| true);
-        let began = Instant::now();
-        let _ = self.stream.finish(|_| began.elapsed() < FAREWELL);
+        let _ = self.port.finish(FAREWELL);
         // Their records are not waited for, and the scripts have had their last turn.
         let _ = self.collect_ended();
         for Transmission { channel, tag, result, .. } in std::mem::take(&mut self.ended).into_iter().flatten()
@@ -422,7 +457,7 @@ impl LiveRun<'_> {
                 .map(|(index, _)| Channel::ALL[*index])
                 .collect::<std::collections::BTreeSet<_>>()
             {
-                let _ = self.device.abort(channel);
+                let _ = self.port.abort(channel);
             }
         }
         self.results.report.frames_not_sent += self.under_way.len() as u64;

@@ -29,4 +29,7 @@ pub enum LiveError {
     /// The device is gone, or refused something.
     #[error(transparent)]
     Device(#[from] DeviceError),
+    /// Whoever has the device does not want the scripts any more.
+    #[error("the scripts' session with the device is over")]
+    Over,
 }

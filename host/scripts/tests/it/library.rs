@@ -259,6 +259,46 @@ fn the_drive_follows_its_controlword_and_falls_into_a_fault() {
     );
 }
 
+/// CiA 305: a first number applies at once, another one from the next reset.
+#[test]
+fn the_drive_takes_its_number_from_an_lss_master() {
+    let source = library::script("drive?node=255&heartbeat=0").unwrap();
+    let tester = script(
+        "tester",
+        r#"
+        fn lss(text) {
+            send("7E5#" + text);
+            let answer = wait_for("7E4", "20ms");
+            if answer == () { "none" } else { from_le(answer.data, 0, 1) + " " + from_le(answer.data, 1, 1) }
+        }
+        fn test_number() {
+            wait("10ms");
+            send("000#0100");
+            send("67F#4008100000000000");
+            check(wait_for("580-77F", "50ms") == (), "without a number it is silent");
+            check(lss("4C00000000000000") == "80 0", "it says that it has none");
+            check(lss("110C000000000000") == "none", "not while it waits");
+            check(lss("0401000000000000") == "none", "all are configured");
+            check(lss("1100000000000000") == "17 1", "0 is no number");
+            check(lss("110C000000000000") == "17 0", "12 is one");
+            send("7E5#0400000000000000");
+            check(expect("70C", "50ms").data == bytes("00"), "it boots");
+            send("60C#4018100400000000");
+            check(from_le(expect("58C", "50ms").data, 4, 4) == 402255, "the serial number stays");
+            check(lss("4C00000000000000") == "none", "it has a number");
+            check(lss("0401000000000000") == "none", "configured again");
+            check(lss("110D000000000000") == "17 0", "13");
+            check(lss("5E00000000000000") == "94 12", "still 12");
+            send("7E5#0400000000000000");
+            check(wait_for("70D", "50ms") == (), "not before a reset");
+            send("000#820C");
+            check(expect("70D", "50ms").data == bytes("00"), "13 from now on");
+        }"#,
+    );
+    let (report, _, _) = run(5, &[source, tester]);
+    assert!(report.is_success(), "{report:?}");
+}
+
 /// Position by its speed and course: 3 m/s north-east for an hour.
 #[test]
 fn the_boat_sails_where_it_heads() {

@@ -5,6 +5,7 @@ mod explain;
 mod hostile;
 mod library;
 mod live;
+mod thread;
 mod twin;
 
 use std::sync::Arc;

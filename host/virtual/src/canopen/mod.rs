@@ -3,7 +3,6 @@
 //! Both follow from their sheet, [`SHEET`], and from the server, the slave and the state machine in this module: no frame is scripted. The
 //! nodes do nothing for which the sheet has no object: they send neither SYNC nor TIME, and keep nothing across a reset.
 
-mod lss;
 mod node;
 #[cfg(test)]
 mod tests;

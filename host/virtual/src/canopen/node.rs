@@ -8,7 +8,7 @@ use cantap_protocols::canopen::eds::Eds;
 use cantap_protocols::serving::canopen::{ObjectDictionary, SdoServer};
 use cantap_wire::{Frame, Id};
 
-use super::lss::{Change, Slave};
+use cantap_protocols::serving::lss::LssSlave;
 
 const MS_NS: u64 = 1_000_000;
 /// How long the node takes to answer, and to boot.
@@ -55,7 +55,7 @@ pub struct CanOpenNode {
     serial: u32,
     dictionary: ObjectDictionary,
     server: SdoServer,
-    slave: Slave,
+    slave: LssSlave,
     state: State,
     boots_ns: Option<u64>,
     beat_ns: u64,
@@ -83,7 +83,7 @@ impl CanOpenNode {
             serial,
             dictionary: ObjectDictionary::default(),
             server: SdoServer::default(),
-            slave: Slave::new([0; 4], node),
+            slave: LssSlave::new([0; 4], node),
             state: if node == NO_NODE { State::Silent } else { State::PreOperational },
             boots_ns: None,
             beat_ns: FIRST_BEAT_NS,
@@ -96,20 +96,20 @@ impl CanOpenNode {
         };
         made.load();
         let identity = [1, 2, 3, 4].map(|sub| made.dictionary.number(0x1018, sub));
-        made.slave = Slave::new(identity, node);
+        made.slave = LssSlave::new(identity, node);
         made
     }
 
     /// Sets everything according to the sheet.
     fn load(&mut self) {
-        self.dictionary = ObjectDictionary::new(&self.sheet, self.slave.node);
+        self.dictionary = ObjectDictionary::new(&self.sheet, self.slave.node());
         self.dictionary.set(0x1018, 4, &self.serial.to_le_bytes());
         self.server = SdoServer::default();
         (self.position_milli, self.syncs) = (0, [0; 2]);
     }
 
     fn node(&self) -> u32 {
-        self.slave.node.into()
+        self.slave.node().into()
     }
 
     fn send(&mut self, at_ns: u64, frame: Frame) {
@@ -281,17 +281,17 @@ impl CanOpenNode {
         }
         let data = heard.data();
         if id == lss::REQUEST.raw() {
-            let (answer, change) = self.slave.take(data);
-            if let Some(bytes) = answer {
+            let was_none = self.slave.node() == NO_NODE;
+            if let Some(bytes) = self.slave.take(data) {
                 self.send(at_ns, frame(lss::RESPONSE.raw(), &bytes));
             }
-            if change == Some(Change::Node) {
+            if was_none && self.slave.node() != NO_NODE {
                 self.load();
                 self.boots_ns = Some(now_ns + BOOT_NS);
             }
             return;
         }
-        if self.slave.node == NO_NODE || self.boots_ns.is_some() {
+        if self.slave.node() == NO_NODE || self.boots_ns.is_some() {
             return;
         }
         match id {
@@ -334,7 +334,7 @@ impl CanOpenNode {
                 self.slave.reset();
                 self.load();
                 (self.state, self.toggle) = (State::Silent, false);
-                self.boots_ns = (self.slave.node != NO_NODE).then_some(now_ns + BOOT_NS);
+                self.boots_ns = (self.slave.node() != NO_NODE).then_some(now_ns + BOOT_NS);
             }
             _ => {}
         }

@@ -201,7 +201,8 @@ pub const fn other_number(from: Channel) -> u8 {
     }
 }
 
-const fn state_name(state: GatewayState) -> &'static str {
+/// Its name in text and JSON.
+pub const fn state_name(state: GatewayState) -> &'static str {
     match state {
         GatewayState::Off => "off",
         GatewayState::Running => "running",

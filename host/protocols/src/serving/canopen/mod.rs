@@ -51,6 +51,16 @@ impl CanOpenServer {
         made
     }
 
+    /// Its number, 1 to 127.
+    pub const fn node(&self) -> u8 {
+        self.node
+    }
+
+    /// It has another number from now on; in its objects from the next [`Self::reset`] on.
+    pub const fn set_node(&mut self, node: u8) {
+        self.node = node;
+    }
+
     /// All objects have the sheet's values again, and what was under way is over.
     pub fn reset(&mut self) {
         self.dictionary = ObjectDictionary::new(&self.sheet, self.node);

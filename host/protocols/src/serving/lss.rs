@@ -1,23 +1,15 @@
 //! A slave of the layer setting services (CiA 305).
 
-use cantap_protocols::canopen::codec::lss::{
-    Bound, LssRequest, LssResponse, NO_NODE, Part, Service, WHOLE_SCAN,
-};
+use crate::canopen::codec::lss::{Bound, LssRequest, LssResponse, NO_NODE, Part, Service, WHOLE_SCAN};
 
-/// What a command from the master changes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Change {
-    /// The node takes part with its new number.
-    Node,
-}
-
-/// The slave.
-#[derive(Debug)]
-pub struct Slave {
+/// The slave. It is given the master's frames, and knows the node's number.
+#[derive(Clone, Debug)]
+pub struct LssSlave {
     /// Vendor, product, revision, serial number.
     identity: [u32; 4],
-    /// Its current number, and the one it will have.
-    pub node: u8,
+    /// Its current number.
+    node: u8,
+    /// The one that it will have.
     pending: u8,
     configured: bool,
     /// How many of the four parts the master has named correctly, one after the other.
@@ -27,27 +19,31 @@ pub struct Slave {
     scanned: u8,
 }
 
-impl Slave {
+impl LssSlave {
+    /// One with this vendor, product, revision and serial number, and this node's number: 1 to 127, or [`NO_NODE`] for none yet.
     pub const fn new(identity: [u32; 4], node: u8) -> Self {
         Self { identity, node, pending: node, configured: false, selected: 0, identified: 0, scanned: 0 }
     }
 
-    /// Takes a frame from the master; returns the answer and what changes.
-    pub fn take(&mut self, bytes: &[u8]) -> (Option<[u8; 8]>, Option<Change>) {
+    /// The node's number. A node without one takes part as soon as the master has given it one and released it, which is in [`Self::take`];
+    /// that of another changes with [`Self::reset`].
+    pub const fn node(&self) -> u8 {
+        self.node
+    }
+
+    /// Takes a frame from the master; returns the answer.
+    pub fn take(&mut self, bytes: &[u8]) -> Option<[u8; 8]> {
         // All frames have 8 bytes (CiA 305, 3.2).
-        let Some(request) = LssRequest::decode(bytes).filter(|_| bytes.len() == 8) else {
-            return (None, None);
-        };
+        let request = LssRequest::decode(bytes).filter(|_| bytes.len() == 8)?;
         if let LssRequest::SwitchGlobal(mode) = request {
             self.configured = mode == 1;
             // A node without a number takes part once it is released with one.
             if !self.configured && self.node == NO_NODE && self.pending != NO_NODE {
                 self.node = self.pending;
-                return (None, Some(Change::Node));
             }
-            return (None, None);
+            return None;
         }
-        (self.respond(request).map(LssResponse::encode), None)
+        self.respond(request).map(LssResponse::encode)
     }
 
     fn respond(&mut self, request: LssRequest) -> Option<LssResponse> {
@@ -98,7 +94,7 @@ impl Slave {
                 }
                 outcome(Service::ConfigureNode, is_right)
             }
-            // Table 0, without its reserved entry. The simulated bus keeps its bit rate.
+            // Table 0, without its reserved entry. The node keeps its bit rate.
             LssRequest::ConfigureBitTiming { table, index } => {
                 outcome(Service::ConfigureBitTiming, table == 0 && matches!(index, 0..=4 | 6..=8))
             }

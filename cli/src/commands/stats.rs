@@ -18,6 +18,7 @@ use crate::args;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::input::{FollowArgs, filtered};
+use crate::range_args::RangeArgs;
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::protocols::{Known, ProtocolArgs};
 use crate::usage_error::usage;
@@ -87,6 +88,8 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     #[command(flatten)]
+    range: RangeArgs,
+    #[command(flatten)]
     read: FollowArgs,
 }
 
@@ -142,7 +145,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
-        let mut records = args.read.open(path, filters)?;
+        let mut records = args.read.open(path, filters)?.within(args.range.range())?;
         let mut closed = |window: &_| {
             if let Some(windows) = &mut windows {
                 windows.push(window);

@@ -35,6 +35,17 @@ pub(crate) trait Decode: Send {
         None
     }
 
+    /// Between two batches: appends what reading on depends on besides the bytes that follow. False if reading cannot begin here, or nowhere in
+    /// files of the format but at their beginning.
+    fn save(&self, _state: &mut Vec<u8>) -> bool {
+        false
+    }
+
+    /// Takes up what [`Self::save`] appended, before anything is read; `None` if that is nonsense.
+    fn restore(&mut self, _state: &[u8]) -> Option<()> {
+        None
+    }
+
     /// Adds records until it finds something else, which is returned; `None` if there are enough, or if it would have to
     /// wait for more. It is in the trait so that each format's [`Self::next`] is inlined into its own loop.
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {

@@ -1,6 +1,7 @@
 //! Reading a trace of any format as a stream.
 
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
@@ -15,7 +16,9 @@ use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
+use super::seek::{Indexing, Reading};
 use super::spec::FormatSpec;
+use super::time_range::TimeRange;
 use cantap_trace::{PlainFrame, TraceRecord, clean};
 
 /// Why a file cannot be opened for reading.
@@ -67,6 +70,10 @@ pub struct TraceReader {
     /// The format according to the name, if the content is in another one.
     named: Option<Format>,
     head: Vec<u8>,
+    /// The index that is made or used, if there is one.
+    indexing: Option<Box<Indexing>>,
+    /// Channels of records that were passed over.
+    passed_channels: BTreeSet<u8>,
 }
 
 /// What is wrong with a line of text that has NUL bytes, such as after a crash.
@@ -169,8 +176,10 @@ fn recognise(
         }
     };
     input.set_zone(options.zone.clone());
-    let reader = TraceReader::new(name.into(), format, input, options);
-    Ok(TraceReader { named, ..reader })
+    let indexing = Indexing::of(path, format, &input, options).map(Box::new);
+    let mut reader = TraceReader::new(name.into(), format, input, options);
+    (reader.named, reader.indexing) = (named, indexing);
+    Ok(reader)
 }
 
 impl TraceReader {
@@ -194,6 +203,8 @@ impl TraceReader {
             records: 0,
             named: None,
             head,
+            indexing: None,
+            passed_channels: BTreeSet::new(),
         }
     }
 
@@ -220,9 +231,59 @@ impl TraceReader {
         self.named
     }
 
-    /// How many records have been decoded so far, some of which may not have been handed out.
+    /// How many records have been decoded so far, some of which may not have been handed out, or were left out by [`Self::within`].
     pub fn records(&self) -> u64 {
         self.records
+    }
+
+    /// Leaves out parts of the file that have nothing in this range, if [`ReadOptions::index`] knows them: records of other times may still come, and what
+    /// is reported at the end is about the whole file. The range learns the time of the first record, which may be among what is left out.
+    /// Without effect once anything was read.
+    ///
+    /// # Errors
+    /// The system's, on the way to the range.
+    pub fn within(&mut self, range: &mut TimeRange) -> io::Result<()> {
+        if range.is_all() || self.records > 0 || self.after.is_some() || self.ended {
+            return Ok(());
+        }
+        self.indexed(|indexing, reading| indexing.begin(Some(range), reading))
+    }
+
+    /// The channels of the records that [`Self::within`] has left out so far.
+    pub fn passed_channels(&self) -> impl Iterator<Item = u8> {
+        self.passed_channels.iter().copied()
+    }
+
+    /// Does something with the index, if there is one, and gives it up if it returns false.
+    fn indexed(
+        &mut self,
+        with: impl FnOnce(&mut Indexing, &mut Reading<'_>) -> io::Result<bool>,
+    ) -> io::Result<()> {
+        let Some(mut indexing) = self.indexing.take() else { return Ok(()) };
+        let mut reading = Reading {
+            input: &mut self.input,
+            decoder: &mut self.decoder,
+            records: &mut self.records,
+            notes: &mut self.notes,
+            left_out: &mut self.left_out,
+            channels: &mut self.passed_channels,
+            issues: self.issues,
+        };
+        if with(&mut indexing, &mut reading)? {
+            self.indexing = Some(indexing);
+        }
+        Ok(())
+    }
+
+    /// Goes on to what is wanted, if there is an index. Called when everything decoded has been handed out.
+    fn step(&mut self) -> io::Result<()> {
+        self.indexed(|indexing, reading| {
+            if !indexing.begin(None, reading)? {
+                return Ok(false);
+            }
+            indexing.step(reading)?;
+            Ok(true)
+        })
     }
 
     /// Whether nothing of the file could be read so far although it is not empty.
@@ -287,6 +348,12 @@ impl TraceReader {
         properties.map(|(name, value)| (name.as_str(), value.as_str()))
     }
 
+    fn keep_index(&mut self) {
+        if let Some(mut indexing) = self.indexing.take() {
+            indexing.finish(&mut self.input);
+        }
+    }
+
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));
@@ -306,13 +373,22 @@ impl TraceReader {
         let Some(after) = self.after.take() else {
             self.batch.clear();
             self.at = 0;
-            self.after = self.decoder.batch(&mut self.input, &mut self.batch).transpose();
+            self.after = match self.step() {
+                Ok(()) => self.decoder.batch(&mut self.input, &mut self.batch).transpose(),
+                Err(error) => Some(Err(error)),
+            };
             self.records += self.batch.len() as u64;
+            if let Some(indexing) = &mut self.indexing {
+                indexing.note(&[], &self.batch);
+            }
             return Beyond::Batch;
         };
         match after {
             Ok(Found::Record(record)) => {
                 self.records += 1;
+                if let Some(indexing) = &mut self.indexing {
+                    indexing.note(&[], &[record]);
+                }
                 self.batch.push(record);
                 Beyond::Batch
             }
@@ -342,6 +418,7 @@ impl TraceReader {
                     return Beyond::Issue(self.issue(Place::Line(line), nul()));
                 }
                 self.ended = true;
+                self.keep_index();
                 if let Some(damage) = self.input.damage() {
                     let fault = Fault::malformed("undamaged compressed data to the end", damage.as_bytes());
                     return Beyond::Issue(self.issue(Place::Offset(self.input.offset()), fault));
@@ -361,6 +438,7 @@ impl TraceReader {
                 Beyond::End
             }
             Err(error) => {
+                self.keep_index();
                 let place = Place::Offset(self.input.offset());
                 Beyond::Issue(self.issue(place, Fault::Io(error)))
             }
@@ -402,8 +480,14 @@ impl TraceReader {
             }
             self.batch.clear();
             self.at = 0;
-            self.after = self.decoder.mixed(&mut self.input, frames, &mut self.batch).transpose();
+            self.after = match self.step() {
+                Ok(()) => self.decoder.mixed(&mut self.input, frames, &mut self.batch).transpose(),
+                Err(error) => Some(Err(error)),
+            };
             self.records += (frames.len() + self.batch.len()) as u64;
+            if let Some(indexing) = &mut self.indexing {
+                indexing.note(frames, &self.batch);
+            }
             if !frames.is_empty() {
                 break;
             }
@@ -420,6 +504,13 @@ impl TraceReader {
             records.extend(self.batch.drain(..).skip(self.at));
         }
         self.at = 0;
+    }
+}
+
+impl Drop for TraceReader {
+    /// What was learned of a file that was not read to its end is worth as much.
+    fn drop(&mut self) {
+        self.keep_index();
     }
 }
 

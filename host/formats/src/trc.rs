@@ -34,6 +34,9 @@ pub enum TrcVersion {
 }
 
 impl TrcVersion {
+    /// The oldest first.
+    const ALL: [Self; 6] = [Self::V1_0, Self::V1_1, Self::V1_2, Self::V1_3, Self::V2_0, Self::V2_1];
+
     /// The name in the file's header; 1.0 has none.
     fn name(self) -> &'static str {
         match self {

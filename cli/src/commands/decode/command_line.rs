@@ -10,6 +10,7 @@ use crate::args;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::FollowArgs;
+use crate::range_args::RangeArgs;
 use crate::live_args::LiveArgs;
 use crate::protocols::ProtocolArgs;
 
@@ -87,6 +88,8 @@ pub struct Args {
     /// Do not report what is wrong with usable databases, and which of them replaces another.
     #[arg(short, long)]
     pub quiet: bool,
+    #[command(flatten)]
+    pub range: RangeArgs,
     #[command(flatten)]
     pub read: FollowArgs,
 }

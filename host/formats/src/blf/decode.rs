@@ -9,6 +9,7 @@ use super::super::codec::{BATCH, Decode, PLAIN_BATCH, REQUESTS_TO_SEND};
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
+use super::super::seek;
 use super::super::zone::Zone;
 use super::containers::{AHEAD_BYTES, Containers};
 use super::kinds::{group, is_left_out};
@@ -117,8 +118,8 @@ impl Decode for Decoder {
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             self.frames(records);
-            // Records that are there do not wait for more input.
-            if records.len() >= BATCH || input.may_wait() && !records.is_empty() {
+            // Records that are there do not wait for more input; and between two containers is a place to read on from.
+            if records.len() >= BATCH || (input.may_wait() || self.is_between()) && !records.is_empty() {
                 return Ok(None);
             }
             match self.next(input)? {
@@ -129,6 +130,25 @@ impl Decode for Decoder {
                 return Ok(None);
             }
         }
+    }
+
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        /// A longer object is not begun before a place.
+        const MOST_BEGUN_BYTES: usize = 4096;
+        let begun = &self.objects[self.at..];
+        self.fault.is_none()
+            && self.is_between()
+            && begun.len() <= MOST_BEGUN_BYTES
+            && seek::save(
+                &(self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, begun),
+                state,
+            )
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, self.objects) =
+            seek::load(state)?;
+        Some(())
     }
 
     fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<bool> {
@@ -167,6 +187,16 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
+    /// Whether nothing more can be read without the next container: at most the beginning of an object is left.
+    fn is_between(&self) -> bool {
+        let rest = &self.objects[self.at..];
+        rest.len() < BASE_HEADER_BYTES || {
+            let (header_len, len) = (usize::from(u16_at(rest, 4)), u32_at(rest, 8) as usize);
+            let is_object = rest.starts_with(OBJECT_MAGIC) && header_len <= len;
+            is_object && (BASE_HEADER_BYTES..=MAX_ITEM_BYTES).contains(&len) && rest.len() < len
+        }
+    }
+
     /// Reads the file's header. A file without one is still read, from the first object on.
     fn head(&mut self, input: &mut Input) -> io::Result<Option<Fault>> {
         self.started = true;

@@ -11,11 +11,13 @@ use super::super::event_text;
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::Fault;
+use super::super::seek;
 use super::super::text;
 use super::super::zone::Zone;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use serde::{Deserialize, Serialize};
 
 const NS_PER_MS: i64 = 1_000_000;
 
@@ -49,7 +51,7 @@ enum Row {
 }
 
 /// The content of each column, counted from 0.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 struct Layout {
     offset: usize,
     kind: Option<usize>,
@@ -63,6 +65,13 @@ struct Layout {
 }
 
 impl Layout {
+    /// Whether all are columns that a row can have.
+    fn is_of_a_row(&self) -> bool {
+        let Self { offset, kind, bus, id, direction, len, len_is_bytes: _, data } = *self;
+        let columns = [Some(offset), kind, bus, Some(id), direction, Some(len), Some(data)];
+        columns.into_iter().flatten().all(|column| column < MAX_COLUMNS)
+    }
+
     /// The fixed columns of version 1, and those of 2.1 unless the header says otherwise.
     fn of(version: TrcVersion) -> Self {
         let fixed = |kind, bus, id, len| {
@@ -124,6 +133,22 @@ impl Decoder {
 }
 
 impl Decode for Decoder {
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        let Self { version, start_ns, has_start, has_layout, has_rows, layout, table, told, zone: _ } = self;
+        let version = TrcVersion::ALL.iter().position(|known| known == version);
+        told.is_none()
+            && seek::save(&(version, start_ns, has_start, has_layout, has_rows, layout, table), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        let (version, layout): (Option<usize>, Layout);
+        (version, self.start_ns, self.has_start, self.has_layout, self.has_rows, layout, self.table) =
+            seek::load(state)?;
+        self.version = *TrcVersion::ALL.get(version?)?;
+        self.layout = Some(layout).filter(Layout::is_of_a_row)?;
+        Some(())
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();

@@ -11,7 +11,7 @@ use super::output::Patch;
 use cantap_trace::{PlainFrame, TraceRecord};
 
 /// Records decoded at a time: few enough to stay in the processor's cache.
-pub(crate) const BATCH: usize = 256;
+pub(crate) const BATCH: usize = if cfg!(test) { 16 } else { 256 };
 
 /// Plain frames decoded at a time: more, because they may go to another thread.
 pub(crate) const PLAIN_BATCH: usize = 4096;

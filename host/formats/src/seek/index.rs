@@ -38,8 +38,8 @@ pub(super) struct Part {
     pub has_issues: bool,
     /// Of its records.
     pub channels: Vec<u8>,
-    notes: Vec<(u32, u64)>,
-    left_out: Vec<(u32, u64)>,
+    pub notes: Vec<(u32, u64)>,
+    pub left_out: Vec<(u32, u64)>,
 }
 
 /// A file's index.

@@ -173,9 +173,13 @@ impl Indexing {
         let wanted = |part: &Part| self.is_wanted(part);
         let next = at + self.index.parts[at..].iter().take_while(|part| !wanted(part)).count();
         if next > at || next == self.index.parts.len() {
-            // Whatever the index says is only used where the reading is where the index says it is.
             let mut state = Vec::new();
-            if !reading.decoder.save(&mut state) || state != self.index.places[at].state {
+            if !reading.decoder.save(&mut state) {
+                // What was read before the place has not been handed out.
+                return Ok(());
+            }
+            // Whatever the index says is only used where the reading is where the index says it is.
+            if state != self.index.places[at].state {
                 return self.distrust(reading);
             }
         }

@@ -8,7 +8,9 @@ use proptest::sample::Index as Any;
 
 use super::{BLOCK_BYTES, IndexFolder};
 use crate::time_range::{TimePoint, TimeRange};
-use crate::{CsvDialect, Format, ReadOptions, TraceReader, TrcVersion, WriteOptions, open_reader};
+use crate::file_writer::FileWriter;
+use crate::output::Output;
+use crate::{CsvDialect, Format, MemoryFile, ReadOptions, TraceReader, TrcVersion, WriteOptions, open_reader};
 use cantap_trace::testing::{data_record, record_or_fd};
 use cantap_trace::{PlainFrame, TraceRecord};
 
@@ -74,14 +76,30 @@ fn assert_same(path: &Path, format: Format, folder: &Path, ranges: &[TimeRange])
             let whole = read(path, &options(format, None), *range, is_mixed);
             let part = read(path, &options(format, Some(folder)), *range, is_mixed);
             let part = Read { handed_out: whole.handed_out, ..part };
-            assert_eq!(part, whole, "{format}, {range:?}");
+            assert_same_items(&part, &whole, format);
         }
     }
 }
 
+/// Shows the first that differs: there may be thousands.
+fn assert_same_items(part: &Read, whole: &Read, format: Format) {
+    let differs = part.items.iter().zip(&whole.items).position(|(part, whole)| part != whole);
+    let at = differs.unwrap_or(part.items.len().min(whole.items.len()));
+    assert_eq!(part.items.get(at), whole.items.get(at), "{format}: {at}");
+    assert_eq!((&part.counts, &part.channels), (&whole.counts, &whole.channels), "{format}");
+}
+
+/// A file in which a container has few records.
 fn file(format: Format, records: &[TraceRecord]) -> Vec<u8> {
-    let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
-    crate::tests::write_with(&options, records).0
+    let memory = MemoryFile::default();
+    let output = Output::Stream(Box::new(memory.clone()));
+    let mut writer = Box::new(FileWriter::new(output, format, &WriteOptions::default()));
+    for few in records.chunks(40) {
+        few.iter().for_each(|record| writer.write(record).unwrap());
+        writer.flush().unwrap();
+    }
+    writer.finish().unwrap();
+    memory.take()
 }
 
 fn indexes(folder: &Path) -> Vec<std::path::PathBuf> {
@@ -200,8 +218,8 @@ fn parts_outside_of_the_range_are_not_read() {
         let first = read(&path, &options(*format, Some(&kept)), range, false);
         assert_eq!((first.handed_out, first.items.len()), (20_000, 100), "{format}");
         let second = read(&path, &options(*format, Some(&kept)), range, false);
-        assert_eq!((second.items, second.counts), (first.items, first.counts), "{format}");
-        assert!(second.handed_out < 8_000, "{format}: {}", second.handed_out);
+        assert_same_items(&second, &first, *format);
+        assert!(second.handed_out < 4_000, "{format}: {}", second.handed_out);
     }
 }
 
@@ -217,12 +235,12 @@ fn a_file_that_grew_keeps_its_index_and_one_that_was_changed_does_not() {
     fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
     assert_eq!(handed_out(), 1000);
     fs::write(&path, &bytes).unwrap();
-    assert!((1000..1100).contains(&handed_out()));
-    assert!((500..600).contains(&handed_out()));
+    assert!((1000..1200).contains(&handed_out()));
+    assert!((500..700).contains(&handed_out()));
     // Only what is before the change is still known.
     let at = bytes.len() / 2 + BLOCK_BYTES;
     bytes[at] ^= 1;
     fs::write(&path, &bytes).unwrap();
     fs::File::options().append(true).open(&path).unwrap().set_modified(std::time::UNIX_EPOCH).unwrap();
-    assert!((900..1100).contains(&handed_out()));
+    assert!((900..1200).contains(&handed_out()));
 }

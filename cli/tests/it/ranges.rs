@@ -43,7 +43,11 @@ fn a_part_of_a_large_trace_is_the_same_with_an_index_and_without() {
     ] {
         let without = cantap_in(Path::new("/dev/null"), arguments);
         assert_eq!(without.0, Some(0), "{arguments:?}: {}", without.2);
-        assert!(without.1.lines().count() > 0 && without.2.contains("100002"), "{arguments:?}: {}", without.2);
+        assert!(
+            without.1.lines().count() > 0 && without.2.contains("100002"),
+            "{arguments:?}: {}",
+            without.2
+        );
         // The first makes an index, which is not trusted at once; the second does.
         for _ in 0..2 {
             assert_eq!(cantap_in(&cache, arguments), without, "{arguments:?}");

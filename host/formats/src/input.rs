@@ -375,7 +375,10 @@ impl Input {
         self.ended = false;
         let inside = inside as usize;
         if self.peek(inside)?.len() < inside {
-            return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "the file became shorter; read it again"));
+            return Err(io::Error::new(
+                io::ErrorKind::UnexpectedEof,
+                "the file became shorter; read it again",
+            ));
         }
         self.consume(inside);
         Ok(())

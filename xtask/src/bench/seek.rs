@@ -44,7 +44,13 @@ fn measure(shell: &Shell, folder: &Path, frames: u64) -> Result<()> {
     println!("seek: {frames} frames of {RECORDING} repeated; a second of it, at {} places", PLACES.len());
     println!(
         "{:<8} {:>6} {:>17} {:>15} {:>23} {:>19} {:>9}",
-        "", "MB", "first reading, s", "with index, s", "a second, median/most", "without, median, s", "index, MB"
+        "",
+        "MB",
+        "first reading, s",
+        "with index, s",
+        "a second, median/most",
+        "without, median, s",
+        "index, MB"
     );
     let mut slow = Vec::new();
     for suffix in ["log", "blf", "asc", "trc", "csv"] {

@@ -10,9 +10,9 @@ use crate::args;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::FollowArgs;
-use crate::range_args::RangeArgs;
 use crate::live_args::LiveArgs;
 use crate::protocols::ProtocolArgs;
+use crate::range_args::RangeArgs;
 
 /// The command line.
 #[derive(clap::Args)]

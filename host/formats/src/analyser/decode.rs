@@ -28,7 +28,10 @@ impl RowDecoder {
     }
 
     /// Takes that up; `None` if it is nonsense.
-    pub(crate) fn restore(&mut self, (separator, start_ns, places): (u8, i64, Vec<Option<usize>>)) -> Option<()> {
+    pub(crate) fn restore(
+        &mut self,
+        (separator, start_ns, places): (u8, i64, Vec<Option<usize>>),
+    ) -> Option<()> {
         let is_place = |place: &usize| *place <= usize::from(u16::MAX);
         places.iter().flatten().all(is_place).then_some(())?;
         (self.separator, self.start_ns, self.places) = (separator, start_ns, places);

@@ -58,7 +58,9 @@ impl IndexFolder {
 
     /// Writes one. Without it, the next reading takes longer: that is no error.
     pub(super) fn keep(&self, path: &Path, index: &Index, how: &str) {
-        let Some(bytes) = index.to_bytes(how).filter(|bytes| bytes.len() as u64 <= MOST_BYTES) else { return };
+        let Some(bytes) = index.to_bytes(how).filter(|bytes| bytes.len() as u64 <= MOST_BYTES) else {
+            return;
+        };
         if self.write(path, &bytes).is_ok() {
             // What cannot be listed or removed stays.
             let _ = self.make_room(path);

@@ -175,12 +175,15 @@ impl Index {
         let texts = stored.texts.iter().map(|text| kept(text)).collect::<Option<Vec<_>>>()?;
         let blocks = Blocks { digests: stored.digests, differs: false };
         let places = &stored.places;
-        let is_known = |counts: &[(u32, u64)]| counts.iter().all(|(number, _)| (*number as usize) < texts.len());
+        let is_known =
+            |counts: &[(u32, u64)]| counts.iter().all(|(number, _)| (*number as usize) < texts.len());
         let is_one = rest.is_empty()
             && stored.made_by == MADE_BY
             && stored.how == how
             && stored.parts.len() + 1 == places.len()
-            && places.windows(2).all(|pair| pair[0].offset < pair[1].offset && pair[0].lines <= pair[1].lines)
+            && places
+                .windows(2)
+                .all(|pair| pair[0].offset < pair[1].offset && pair[0].lines <= pair[1].lines)
             && places.last().is_some_and(|end| end.offset <= blocks.bytes())
             && stored.parts.iter().all(|part| is_known(&part.notes) && is_known(&part.left_out));
         is_one.then_some(())?;

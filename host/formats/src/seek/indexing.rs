@@ -116,7 +116,11 @@ impl Indexing {
 
     /// Begins to read what is in the range, of which the times of the first record may become known; all of it without one. Returns whether there is
     /// anything to do while reading.
-    pub(crate) fn begin(&mut self, range: Option<&mut TimeRange>, reading: &mut Reading<'_>) -> io::Result<bool> {
+    pub(crate) fn begin(
+        &mut self,
+        range: Option<&mut TimeRange>,
+        reading: &mut Reading<'_>,
+    ) -> io::Result<bool> {
         if std::mem::replace(&mut self.has_begun, true) {
             return Ok(true);
         }
@@ -246,7 +250,9 @@ impl Indexing {
             return;
         }
         let frames_of = frames.iter().map(|frame| (frame.time_ns, frame.channel));
-        for (time_ns, channel) in frames_of.chain(records.iter().map(|record| (record.time_ns, record.channel))) {
+        for (time_ns, channel) in
+            frames_of.chain(records.iter().map(|record| (record.time_ns, record.channel)))
+        {
             self.index.first_ns.get_or_insert(time_ns);
             self.open.min_ns = self.open.min_ns.min(time_ns);
             self.open.max_ns = self.open.max_ns.max(time_ns);
@@ -266,7 +272,8 @@ impl Indexing {
         if !std::mem::take(&mut self.is_new) || self.index.parts.is_empty() {
             return;
         }
-        let now = input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about));
+        let now =
+            input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about));
         self.index.identity = now.filter(|now| Some(*now) == self.identity);
         self.folder.keep(&self.path, &self.index, &self.how);
     }

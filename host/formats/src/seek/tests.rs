@@ -7,10 +7,13 @@ use proptest::prelude::*;
 use proptest::sample::Index as Any;
 
 use super::{BLOCK_BYTES, IndexFolder};
-use crate::time_range::{TimePoint, TimeRange};
 use crate::file_writer::FileWriter;
 use crate::output::Output;
-use crate::{CsvDialect, Format, MemoryFile, ReadOptions, TraceReader, TrcVersion, WriteOptions, open_reader};
+use crate::time_range::{TimePoint, TimeRange};
+use crate::{
+    CsvDialect, Format, MemoryFile, ReadOptions, TraceReader, TraceWriter, TrcVersion, WriteOptions,
+    open_reader,
+};
 use cantap_trace::testing::{data_record, record_or_fd};
 use cantap_trace::{PlainFrame, TraceRecord};
 
@@ -123,7 +126,11 @@ fn any_range(times: Vec<i64>) -> impl Strategy<Value = TimeRange> {
         let times = times.clone();
         (any::<Any>(), any::<bool>(), -1..2_i64).prop_map(move |(at, is_absolute, more)| {
             let time_ns = times[at.index(times.len())].saturating_add(more);
-            if is_absolute { TimePoint::At(time_ns) } else { TimePoint::AfterFirst(time_ns.saturating_sub(times[0])) }
+            if is_absolute {
+                TimePoint::At(time_ns)
+            } else {
+                TimePoint::AfterFirst(time_ns.saturating_sub(times[0]))
+            }
         })
     };
     (prop::option::weighted(0.8, point()), prop::option::weighted(0.8, point()))
@@ -131,13 +138,15 @@ fn any_range(times: Vec<i64>) -> impl Strategy<Value = TimeRange> {
 }
 
 fn any_records() -> impl Strategy<Value = (Vec<TraceRecord>, Vec<TimeRange>)> {
-    (prop::collection::vec(record_or_fd(1000), 1..400), any::<bool>()).prop_flat_map(|(mut records, is_sorted)| {
-        if is_sorted {
-            records.sort_by_key(|record| record.time_ns);
-        }
-        let times = records.iter().map(|record| record.time_ns).collect();
-        (Just(records), prop::collection::vec(any_range(times), 1..6))
-    })
+    (prop::collection::vec(record_or_fd(1000), 1..400), any::<bool>()).prop_flat_map(
+        |(mut records, is_sorted)| {
+            if is_sorted {
+                records.sort_by_key(|record| record.time_ns);
+            }
+            let times = records.iter().map(|record| record.time_ns).collect();
+            (Just(records), prop::collection::vec(any_range(times), 1..6))
+        },
+    )
 }
 
 proptest! {

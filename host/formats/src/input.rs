@@ -1,9 +1,11 @@
 //! Where a reader's bytes come from: a file or standard input, plain or compressed, finished or
 //! still growing. One buffer of bounded size; lines are slices of it.
 
+mod blocks;
+
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
@@ -11,7 +13,7 @@ use super::carriage_return::{self, ToLineFeed};
 use super::compression::{self, Compression};
 use super::found::Found;
 use super::issue::{Fault, Place};
-use super::seek::{BLOCK_BYTES, Blocks};
+use super::seek::Blocks;
 use super::utf16::{self, ToUtf8, Utf16};
 use super::whole::{MAX_MEMORY_BYTES, Whole};
 use super::zone::Zone;
@@ -246,11 +248,6 @@ impl Input {
         self.nul_lines.pop_front()
     }
 
-    /// Whether there is one.
-    pub(crate) fn has_nul_line(&self) -> bool {
-        !self.nul_lines.is_empty()
-    }
-
     /// Whether compressed data ended before its own end mark.
     pub(crate) fn compressed_data_cut(&self) -> bool {
         self.cut
@@ -322,66 +319,6 @@ impl Input {
                 Err(error) => return Err(error),
             }
         }
-    }
-
-    /// Reads up to the end of a block, and compares or learns it.
-    fn fill_block(&mut self) -> io::Result<bool> {
-        let at = self.offset + (self.end - self.start) as u64;
-        let rest = BLOCK_BYTES as u64 - at % BLOCK_BYTES as u64;
-        let (before, source) = (self.end, &mut self.source);
-        let block = &mut self.buffer[before..before + rest as usize];
-        let mut len = 0;
-        while len < block.len() {
-            match source.read(&mut block[len..]) {
-                Ok(0) => break,
-                Ok(read) => len += read,
-                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-                Err(error) => return Err(error),
-            }
-        }
-        if let Some(blocks) = &mut self.blocks {
-            blocks.read(at, &block[..len])?;
-        }
-        self.has_nul = self.has_nul || memchr::memchr(0, &block[..len]).is_some();
-        self.end += len;
-        self.ended = len == 0;
-        Ok(len > 0)
-    }
-
-    /// The file itself, if its bytes are read as they are.
-    pub(crate) fn file(&self) -> Option<&File> {
-        self.file.as_ref()
-    }
-
-    /// What is read from the next [`Self::seek_to`] on is compared with these digests, or added to them.
-    pub(crate) fn set_blocks(&mut self, blocks: Option<Blocks>) {
-        self.blocks = blocks;
-    }
-
-    /// The digests.
-    pub(crate) fn take_blocks(&mut self) -> Option<Blocks> {
-        self.blocks.take()
-    }
-
-    /// Goes to a place in [`Self::file`], before which there are so many lines.
-    pub(crate) fn seek_to(&mut self, offset: u64, lines: u64) -> io::Result<()> {
-        let Some(file) = &mut self.file else { return Err(io::ErrorKind::Unsupported.into()) };
-        // Whole blocks are compared. The source has the same position, because it is the same file.
-        let inside = offset % BLOCK_BYTES as u64;
-        file.seek(SeekFrom::Start(offset - inside))?;
-        (self.start, self.end) = (0, 0);
-        self.offset = offset - inside;
-        self.lines = lines;
-        self.ended = false;
-        let inside = inside as usize;
-        if self.peek(inside)?.len() < inside {
-            return Err(io::Error::new(
-                io::ErrorKind::UnexpectedEof,
-                "the file became shorter; read it again",
-            ));
-        }
-        self.consume(inside);
-        Ok(())
     }
 
     /// At least `len` bytes (at most [`MAX_ITEM_BYTES`]) without using them up; fewer only at the end.

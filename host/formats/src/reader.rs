@@ -1,5 +1,7 @@
 //! Reading a trace of any format as a stream.
 
+mod indexed;
+
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::io::{self, Read};
@@ -16,9 +18,8 @@ use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
-use super::seek::{Indexing, Reading};
+use super::seek::Indexing;
 use super::spec::FormatSpec;
-use super::time_range::TimeRange;
 use cantap_trace::{PlainFrame, TraceRecord, clean};
 
 /// Why a file cannot be opened for reading.
@@ -236,56 +237,6 @@ impl TraceReader {
         self.records
     }
 
-    /// Leaves out parts of the file that have nothing in this range, if [`ReadOptions::index`] knows them: records of other times may still come, and what
-    /// is reported at the end is about the whole file. The range learns the time of the first record, which may be among what is left out.
-    /// Without effect once anything was read.
-    ///
-    /// # Errors
-    /// The system's, on the way to the range.
-    pub fn within(&mut self, range: &mut TimeRange) -> io::Result<()> {
-        if range.is_all() || self.records > 0 || self.after.is_some() || self.ended {
-            return Ok(());
-        }
-        self.indexed(|indexing, reading| indexing.begin(Some(range), reading))
-    }
-
-    /// The channels of the records that [`Self::within`] has left out so far.
-    pub fn passed_channels(&self) -> impl Iterator<Item = u8> {
-        self.passed_channels.iter().copied()
-    }
-
-    /// Does something with the index, if there is one, and gives it up if it returns false.
-    fn indexed(
-        &mut self,
-        with: impl FnOnce(&mut Indexing, &mut Reading<'_>) -> io::Result<bool>,
-    ) -> io::Result<()> {
-        let Some(mut indexing) = self.indexing.take() else { return Ok(()) };
-        let mut reading = Reading {
-            input: &mut self.input,
-            decoder: &mut self.decoder,
-            records: &mut self.records,
-            notes: &mut self.notes,
-            left_out: &mut self.left_out,
-            channels: &mut self.passed_channels,
-            issues: self.issues,
-        };
-        if with(&mut indexing, &mut reading)? {
-            self.indexing = Some(indexing);
-        }
-        Ok(())
-    }
-
-    /// Goes on to what is wanted, if there is an index. Called when everything decoded has been handed out.
-    fn step(&mut self) -> io::Result<()> {
-        self.indexed(|indexing, reading| {
-            if !indexing.begin(None, reading)? {
-                return Ok(false);
-            }
-            indexing.step(reading)?;
-            Ok(true)
-        })
-    }
-
     /// Whether nothing of the file could be read so far although it is not empty.
     pub fn nothing_read(&self) -> Option<NothingRead> {
         // Without a head, comments alone show nothing of a format.
@@ -346,12 +297,6 @@ impl TraceReader {
     pub fn properties(&self) -> impl Iterator<Item = (&str, &str)> {
         let properties = self.decoder.properties().into_iter().flatten();
         properties.map(|(name, value)| (name.as_str(), value.as_str()))
-    }
-
-    fn keep_index(&mut self) {
-        if let Some(mut indexing) = self.indexing.take() {
-            indexing.finish(&mut self.input);
-        }
     }
 
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
@@ -504,13 +449,6 @@ impl TraceReader {
             records.extend(self.batch.drain(..).skip(self.at));
         }
         self.at = 0;
-    }
-}
-
-impl Drop for TraceReader {
-    /// What was learned of a file that was not read to its end is worth as much.
-    fn drop(&mut self) {
-        self.keep_index();
     }
 }
 

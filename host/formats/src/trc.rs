@@ -6,6 +6,7 @@
 
 mod decode;
 mod encode;
+mod layout;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;

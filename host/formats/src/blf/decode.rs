@@ -2,7 +2,7 @@
 
 use std::io;
 
-use flate2::{Decompress, FlushDecompress, Status};
+use flate2::Decompress;
 
 use super::super::calendar::Date;
 use super::super::codec::{BATCH, Decode, PLAIN_BATCH, REQUESTS_TO_SEND};
@@ -14,6 +14,7 @@ use super::super::zone::Zone;
 use super::containers::{AHEAD_BYTES, Containers};
 use super::kinds::{group, is_left_out};
 use super::object::{Content, event, u16_at, u32_at, u64_at};
+use super::unpack::{inflate, skip_to_object};
 use super::{
     BASE_HEADER_BYTES, CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
     DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HEADER_BYTES,
@@ -468,48 +469,6 @@ impl Decoder {
                 self.at = self.objects.len();
                 Object::Issue(Fault::malformed(EXPECTED_OBJECT, &found))
             }
-        }
-    }
-}
-
-/// Skips to the next LOBJ in the file, or to its end.
-fn skip_to_object(input: &mut Input) -> io::Result<()> {
-    loop {
-        let bytes = input.peek(OBJECT_MAGIC.len())?;
-        if bytes.len() < OBJECT_MAGIC.len() {
-            let rest = bytes.len();
-            input.consume(rest);
-            return Ok(());
-        }
-        if let Some(at) = memchr::memmem::find(bytes, OBJECT_MAGIC) {
-            input.consume(at);
-            return Ok(());
-        }
-        let searched = bytes.len() + 1 - OBJECT_MAGIC.len();
-        input.consume(searched);
-    }
-}
-
-/// Appends the decompressed content of a zlib stream; false if it is damaged, cut or implausibly large.
-fn inflate(decompressor: &mut Decompress, mut data: &[u8], expected_len: usize, out: &mut Vec<u8>) -> bool {
-    const STEP_BYTES: usize = 256 * 1024;
-    let limit = out.len() + MAX_ITEM_BYTES;
-    decompressor.reset(true);
-    out.reserve(expected_len.min(MAX_ITEM_BYTES));
-    loop {
-        let (before_in, before_out) = (decompressor.total_in(), decompressor.total_out());
-        let status = decompressor.decompress_vec(data, out, FlushDecompress::None);
-        let used = (decompressor.total_in() - before_in) as usize;
-        data = &data[used..];
-        match status {
-            Ok(Status::StreamEnd) => return true,
-            Ok(_) if out.len() == out.capacity() && out.len() < limit => out.reserve(STEP_BYTES),
-            Ok(_) if used > 0 || decompressor.total_out() > before_out => {
-                if out.len() >= limit {
-                    return false;
-                }
-            }
-            _ => return false,
         }
     }
 }

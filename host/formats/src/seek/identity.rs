@@ -1,12 +1,8 @@
 //! Whether a file is the one it was, by what the system says of it.
 
 use std::fs::Metadata;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
-
-/// Some systems count changes in steps of two seconds: a second change within one looks like the first.
-const STEP: Duration = if cfg!(test) { Duration::ZERO } else { Duration::from_secs(2) };
 
 /// A file as it was at a time.
 ///
@@ -26,6 +22,10 @@ impl Identity {
     #[cfg(unix)]
     pub(super) fn of(file: &Metadata) -> Option<Self> {
         use std::os::unix::fs::MetadataExt;
+        use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+        /// Some systems count changes in steps of two seconds: a second change within one looks like the first.
+        const STEP: Duration = if cfg!(test) { Duration::ZERO } else { Duration::from_secs(2) };
         let ns = |seconds: i64, ns: i64| i128::from(seconds) * 1_000_000_000 + i128::from(ns);
         let identity = Self {
             device: file.dev(),

@@ -165,7 +165,9 @@ impl Indexing {
     pub(crate) fn step(&mut self, reading: &mut Reading<'_>) -> io::Result<()> {
         let offset = reading.input.offset();
         if self.is_learning {
-            if self.index.is_due(offset) && !reading.input.has_nul_line() {
+            // At the file's end may be a part of a line, of which the rest is still to be written.
+            let is_end = |input: &mut Input| input.peek(1).map(<[u8]>::is_empty);
+            if self.index.is_due(offset) && !reading.input.has_nul_line() && !is_end(reading.input)? {
                 self.learn(reading, offset);
             }
             return Ok(());

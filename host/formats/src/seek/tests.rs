@@ -253,3 +253,21 @@ fn a_file_that_grew_keeps_its_index_and_one_that_was_changed_does_not() {
     fs::File::options().append(true).open(&path).unwrap().set_modified(std::time::UNIX_EPOCH).unwrap();
     assert!((900..1200).contains(&handed_out()));
 }
+
+/// Found by random files: a place in the middle of a line.
+#[test]
+fn a_line_that_was_half_written_is_read_when_it_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, kept) = (folder.path().join("trace"), folder.path().join("indexes"));
+    let line = "(1.000000) can0 123#1122334455667788\n";
+    let mut text = format!("{:#<192}\n", "") + &line.repeat(64);
+    // The last block ends before the last line's end.
+    assert_eq!(text.len() % BLOCK_BYTES, 1);
+    fs::write(&path, &text[..text.len() - 1]).unwrap();
+    let range = TimeRange::new(Some(TimePoint::At(5_000_000_000)), None);
+    assert_same(&path, Format::Candump, &kept, &[range]);
+    text += &line.repeat(10);
+    text += "(9.000000) can0 123#11\nrubbish\n";
+    fs::write(&path, &text).unwrap();
+    assert_same(&path, Format::Candump, &kept, &[range]);
+}

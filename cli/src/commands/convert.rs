@@ -197,7 +197,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let read = FollowArgs { read, follow: args.follow };
     let filters = read.filters(&args.databases.load(false, true)?)?;
-    let mut records = read.open(&args.input, filters)?.within(args.range.range())?;
+    let mut records = read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let grows = records.end_when(interrupt::requested);
     if grows {
         interrupt::watch()?;

@@ -202,7 +202,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
 
 /// Where nothing was found, if that is only a part of the trace.
 fn within(args: &Args) -> &'static str {
-    if !args.range.range().is_all() { " between --start and --end" } else { "" }
+    if args.range.is_given() { " between --start and --end" } else { "" }
 }
 
 /// Reads the part of the trace to be drawn.
@@ -211,7 +211,7 @@ fn for_each(
     filters: Vec<Filter>,
     mut take: impl FnMut(&cantap::TraceRecord),
 ) -> anyhow::Result<Read> {
-    let mut records = args.read.open(&args.input, filters)?.within(args.range.range())?;
+    let mut records = args.read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let mut batch = Vec::new();
     let mut first_ns = None;
     while records.next_batch(&mut batch)? {

@@ -120,9 +120,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ids.extend(id.resolve(&decoder).map_err(|error| not_a_message("--id", &error))?);
     }
     let search = Search { ids, data: args.data.clone(), condition };
-    let filters = args.read.filters(&decoder)?;
+    let (filters, range) = (args.read.filters(&decoder)?, args.range.of(args.input.as_ref())?);
     let records = args.read.open_either(args.input.as_ref(), &args.live, filters)?;
-    let mut records = records.within(args.range.range())?;
+    let mut records = records.within(range)?;
     let mut sink = Sink::new(args, decoder, records.grows())?;
     let mut search = search;
     let found = find(args, &mut records, &mut search, &mut sink)?;

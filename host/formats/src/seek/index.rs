@@ -112,6 +112,10 @@ impl Index {
         let places = self.places.iter().take_while(|place| place.offset <= bytes).count();
         self.places.truncate(places);
         self.parts.truncate(places.saturating_sub(1));
+        // The first record may be behind that, and be another one now.
+        if self.parts.iter().all(|part| part.records == 0) {
+            self.first_ns = None;
+        }
     }
 
     /// How much there is of what, as a part has it.

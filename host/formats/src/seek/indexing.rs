@@ -142,8 +142,9 @@ impl Indexing {
                     index.prove();
                     self.is_new = true;
                 }
-                self.range = index.first_ns.and_then(|first_ns| range.beginning_at(first_ns));
-                Some(index).filter(|index| self.range.is_some() && index.places.first() == Some(&first))
+                let first_ns = index.first_ns.filter(|_| index.places.first() == Some(&first));
+                self.range = first_ns.and_then(|first_ns| range.beginning_at(first_ns));
+                Some(index).filter(|_| self.range.is_some())
             }
             _ => None,
         };

@@ -271,3 +271,18 @@ fn a_line_that_was_half_written_is_read_when_it_is_whole() {
     fs::write(&path, &text).unwrap();
     assert_same(&path, Format::Candump, &kept, &[range]);
 }
+
+#[test]
+fn a_file_that_was_replaced_has_another_first_record() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, kept) = (folder.path().join("trace"), folder.path().join("indexes"));
+    let range = TimeRange::new(Some(TimePoint::AfterFirst(1_000_000_000)), None);
+    for first_s in [1_000, 2_000, 500] {
+        let records: Vec<_> =
+            (0..2000).map(|at| data_record(first_s * 1_000_000_000 + at * 1_000_000)).collect();
+        fs::write(&path, file(Format::Candump, &records)).unwrap();
+        let written = std::time::UNIX_EPOCH + std::time::Duration::from_secs(first_s as u64);
+        fs::File::options().append(true).open(&path).unwrap().set_modified(written).unwrap();
+        assert_same(&path, Format::Candump, &kept, &[range]);
+    }
+}

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use cantap::TraceRecord;
+use cantap_formats::time_range::TimeRange;
 use cantap_formats::{Columns, Format, LeftOut, ReadOptions, Zone, open_reader};
 use cantap_signals::Decoder;
 use cantap_signals::named::{NameError, NamedFilter};
@@ -13,6 +14,7 @@ use cantap_trace::filter::Filter;
 use crate::completion;
 use crate::live_args::LiveArgs;
 use crate::usage_error::usage;
+use cantap_work::cache;
 use cantap_work::interrupt;
 use cantap_work::live::LiveRecords;
 use cantap_work::missing::Missing;
@@ -122,6 +124,7 @@ const ISSUES_SHOWN: u64 = 20;
 pub struct Records {
     source: Source,
     filters: Vec<Filter>,
+    range: TimeRange,
     strict: bool,
     /// The batch from which [`Self::next`] takes; the records before `at` are used up.
     batch: Vec<TraceRecord>,
@@ -152,6 +155,7 @@ impl ReadArgs {
             strict: self.strict,
             zone: self.zone.clone(),
             columns: self.columns.clone(),
+            index: cache::indexes(),
         };
         let mut reader = open_reader(path, &options)?;
         if let Some(named) = reader.named_otherwise() {
@@ -171,8 +175,17 @@ impl ReadArgs {
 }
 
 impl Records {
-    const fn new(source: Source, filters: Vec<Filter>, strict: bool) -> Self {
-        Self { source, filters, strict, batch: Vec::new(), at: 0 }
+    fn new(source: Source, filters: Vec<Filter>, strict: bool) -> Self {
+        Self { source, filters, range: TimeRange::default(), strict, batch: Vec::new(), at: 0 }
+    }
+
+    /// Only the records in a range, which may begin at a time after the first record, whether or not that passes the filters.
+    pub fn within(mut self, mut range: TimeRange) -> anyhow::Result<Self> {
+        if let Source::File(reader, _) = &mut self.source {
+            reader.within(&mut range)?;
+        }
+        self.range = range;
+        Ok(self)
     }
 
     /// Whether the next record may take a while, so that results should not be buffered.
@@ -234,6 +247,9 @@ impl Records {
             Source::File(reader, _) => batch_of_file(reader, self.strict, records)?,
             Source::Device(live) => live.next_batch(records)?,
         };
+        if !self.range.is_all() {
+            records.retain(|record| self.range.contains(record));
+        }
         if !self.filters.is_empty() {
             records.retain(|record| self.filters.iter().any(|filter| filter.accepts(record)));
         }

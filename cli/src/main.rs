@@ -37,6 +37,7 @@ mod page;
 mod print_sent;
 mod progress;
 mod protocols;
+mod range_args;
 mod shells;
 mod speak_args;
 mod stderr;

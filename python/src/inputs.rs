@@ -3,7 +3,8 @@
 use std::io::{self, Read};
 use std::path::PathBuf;
 
-use cantap_formats::{ReadOptions, TraceReader, open_reader, open_source};
+use cantap_formats::time_range::TimeRange;
+use cantap_formats::{OpenError, ReadOptions, TraceReader, open_reader, open_source};
 use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::pybacked::PyBackedBytes;
@@ -41,13 +42,15 @@ impl TraceFile {
         }
     }
 
-    /// Opens it.
-    pub fn open(&self, options: &ReadOptions) -> Result<TraceReader, Error> {
+    /// Opens it, to read what is in a range.
+    pub fn open(&self, options: &ReadOptions, range: &mut TimeRange) -> Result<TraceReader, Error> {
         let opened = match self {
             Self::Path(path) => open_reader(path, options),
             Self::Opened { name, open } => open_source(name, PythonFile::open(open)?, options),
         };
-        opened.map_err(Error::from)
+        let mut reader = opened.map_err(Error::from)?;
+        reader.within(range).map_err(|error| OpenError::Io(self.name(), error))?;
+        Ok(reader)
     }
 }
 

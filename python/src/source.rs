@@ -73,6 +73,7 @@ impl Options {
             format,
             strict: self.strict,
             zone: zone.unwrap_or_default(),
+            index: cantap_work::cache::indexes(),
             ..ReadOptions::default()
         })
     }
@@ -110,11 +111,11 @@ impl TraceSource {
         let Some(first) = options.files.first() else {
             return Err(Error::argument("no file is given; name at least one"));
         };
-        let reader = first.open(&read)?;
+        let mut window = TimeRange::new(start, end);
+        let reader = first.open(&read, &mut window)?;
         let counts = Counts::of(first.name(), &reader);
         report.set(counts.clone());
         let is_all = filters.is_empty() && options.channels.is_empty() && start.is_none() && end.is_none();
-        let window = TimeRange::new(start, end);
         let channels = options.channels.clone();
         Ok(Self {
             reader,
@@ -196,7 +197,7 @@ impl TraceSource {
             self.report.push_file(self.counts.clone());
         }
         let Some(next) = self.files.get(self.file + 1) else { return Ok(false) };
-        self.reader = next.open(&self.read)?;
+        self.reader = next.open(&self.read, &mut self.window)?;
         let counts = Counts::of(next.name(), &self.reader);
         let done = std::mem::replace(&mut self.counts, counts);
         match &mut self.before {
@@ -211,6 +212,7 @@ impl TraceSource {
     /// Brings the report up to date.
     pub fn tell(&mut self) {
         self.counts.update(&self.reader);
+        self.counts.channels.extend(self.reader.passed_channels());
         self.report.set(self.all_counts());
     }
 

@@ -7,7 +7,6 @@ use std::process::ExitCode;
 use anyhow::bail;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::Key;
-use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{
     Columns, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
 };
@@ -19,6 +18,7 @@ use crate::columns;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::{FollowArgs, ReadArgs};
+use crate::range_args::RangeArgs;
 use crate::trace_output::{TraceOutput, named};
 use cantap_work::interrupt;
 use cantap_work::missing::by_kind;
@@ -57,13 +57,8 @@ pub struct Args {
     /// Only these channels: 1, 2, several as 1,3. Can be repeated. Default: all.
     #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
     channel: Vec<u8>,
-    /// From this time: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in
-    /// UTC.
-    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
-    start: Option<TimePoint>,
-    /// Up to this time, exclusive.
-    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
-    end: Option<TimePoint>,
+    #[command(flatten)]
+    range: RangeArgs,
     #[command(flatten)]
     write: WriteArgs,
     /// Make OUT a folder of Parquet files, in folders named after these, in this order: day, channel, or NAME=VALUE. Engines read
@@ -202,7 +197,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let read = FollowArgs { read, follow: args.follow };
     let filters = read.filters(&args.databases.load(false, true)?)?;
-    let mut records = read.open(&args.input, filters)?;
+    let mut records = read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let grows = records.end_when(interrupt::requested);
     if grows {
         interrupt::watch()?;
@@ -210,7 +205,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut output: Option<TraceOutput> = None;
     // Only once there is something to write: if nothing can be read, an older OUT stays unchanged.
     let create = || args.create(&options, grows);
-    let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
     let read = loop {
@@ -224,9 +218,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             none => none.insert(create()?),
         };
         for record in &batch {
-            // The window starts at the trace's first record, whatever its channel.
-            let inside = window.contains(record);
-            if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
+            if args.channel.is_empty() || args.channel.contains(&record.channel) {
                 output.write(record)?;
                 written += 1;
             }

@@ -61,7 +61,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let decoder = load_selected(&databases, args.read.strict, args.quiet, &args.signals)?;
     let form = Form::of(args)?;
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live, args.read.filters(&decoder)?)?;
+    let (filters, range) = (args.read.filters(&decoder)?, args.range.of(args.input.as_ref())?);
+    let records = args.read.open_either(args.input.as_ref(), &args.live, filters)?;
+    let mut records = records.within(range)?;
     let mut output = Output::open(args, form, &decoder)?;
     let count = decode(args, &decoder, &mut records, &mut output)?;
     let mut summary = serde_json::to_value(&count)?;

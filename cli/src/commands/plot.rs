@@ -12,7 +12,7 @@ use cantap_analysis::plot::{
     TextStyle, TimingCollector,
 };
 use cantap_analysis::stats::Options;
-use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
+use cantap_formats::time_range::date_text;
 use cantap_trace::filter::Filter;
 use cantap_trace::grammar;
 
@@ -20,6 +20,7 @@ use crate::args;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load, load_selected};
 use crate::input::{ReadArgs, filtered};
+use crate::range_args::RangeArgs;
 use crate::trace_output::failed;
 use crate::usage_error::usage;
 use cantap_work::atomic_file;
@@ -67,13 +68,8 @@ pub struct Args {
     /// Width: pixels in a file, columns in the terminal.
     #[arg(long)]
     width: Option<u32>,
-    /// Leave out everything before this time: since the trace's start (10s, 2m), seconds since 1970, or a
-    /// date.
-    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
-    start: Option<TimePoint>,
-    /// Leave out everything from this time on; written like --start.
-    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
-    end: Option<TimePoint>,
+    #[command(flatten)]
+    range: RangeArgs,
     /// The vertical range, LOW:HIGH.
     #[arg(long = "y", value_name = "LOW:HIGH", value_parser = vertical, allow_hyphen_values = true)]
     vertical: Option<(f64, f64)>,
@@ -206,7 +202,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
 
 /// Where nothing was found, if that is only a part of the trace.
 fn within(args: &Args) -> &'static str {
-    if args.start.is_some() || args.end.is_some() { " between --start and --end" } else { "" }
+    if args.range.is_given() { " between --start and --end" } else { "" }
 }
 
 /// Reads the part of the trace to be drawn.
@@ -215,12 +211,11 @@ fn for_each(
     filters: Vec<Filter>,
     mut take: impl FnMut(&cantap::TraceRecord),
 ) -> anyhow::Result<Read> {
-    let mut records = args.read.open(&args.input, filters)?;
-    let mut window = TimeRange::new(args.start, args.end);
+    let mut records = args.read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let mut batch = Vec::new();
     let mut first_ns = None;
     while records.next_batch(&mut batch)? {
-        for record in batch.iter().filter(|record| window.contains(record)) {
+        for record in &batch {
             first_ns = first_ns.or(Some(record.time_ns));
             take(record);
         }

@@ -21,6 +21,7 @@ use crate::exit;
 use crate::input::{FollowArgs, Records, not_a_message};
 use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
+use crate::range_args::RangeArgs;
 use crate::trace_output::TraceOutput;
 use crate::usage_error::usage;
 use cantap_trace::Seconds;
@@ -93,6 +94,8 @@ pub struct Args {
     #[arg(short, long)]
     quiet: bool,
     #[command(flatten)]
+    range: RangeArgs,
+    #[command(flatten)]
     read: FollowArgs,
 }
 
@@ -117,7 +120,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ids.extend(id.resolve(&decoder).map_err(|error| not_a_message("--id", &error))?);
     }
     let search = Search { ids, data: args.data.clone(), condition };
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live, args.read.filters(&decoder)?)?;
+    let (filters, range) = (args.read.filters(&decoder)?, args.range.of(args.input.as_ref())?);
+    let records = args.read.open_either(args.input.as_ref(), &args.live, filters)?;
+    let mut records = records.within(range)?;
     let mut sink = Sink::new(args, decoder, records.grows())?;
     let mut search = search;
     let found = find(args, &mut records, &mut search, &mut sink)?;

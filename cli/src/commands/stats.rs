@@ -20,6 +20,7 @@ use crate::database_args::{DatabaseArgs, load};
 use crate::input::{FollowArgs, filtered};
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
 use crate::protocols::{Known, ProtocolArgs};
+use crate::range_args::RangeArgs;
 use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channels::Channels;
@@ -87,6 +88,8 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     #[command(flatten)]
+    range: RangeArgs,
+    #[command(flatten)]
     read: FollowArgs,
 }
 
@@ -108,6 +111,7 @@ impl Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let range = args.range.of(args.input.as_ref())?;
     let names =
         if args.input.is_some() { args.databases.options() } else { args.databases.or_of(&args.device) };
     let filters = args.read.filters(&load(&names, false, true)?)?;
@@ -142,7 +146,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
-        let mut records = args.read.open(path, filters)?;
+        let mut records = args.read.open(path, filters)?.within(range)?;
         let mut closed = |window: &_| {
             if let Some(windows) = &mut windows {
                 windows.push(window);

@@ -57,6 +57,7 @@ mod outputs;
 mod port;
 mod protocols;
 mod python_can;
+mod ranges;
 mod readme;
 mod ready_nodes;
 mod report;

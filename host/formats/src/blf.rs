@@ -10,6 +10,7 @@ mod decode;
 mod encode;
 mod kinds;
 mod object;
+mod unpack;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;

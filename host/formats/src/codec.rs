@@ -11,7 +11,7 @@ use super::output::Patch;
 use cantap_trace::{PlainFrame, TraceRecord};
 
 /// Records decoded at a time: few enough to stay in the processor's cache.
-pub(crate) const BATCH: usize = 256;
+pub(crate) const BATCH: usize = if cfg!(test) { 16 } else { 256 };
 
 /// Plain frames decoded at a time: more, because they may go to another thread.
 pub(crate) const PLAIN_BATCH: usize = 4096;
@@ -32,6 +32,17 @@ pub(crate) trait Decode: Send {
 
     /// What the file says about its measurement, once something was read; `None` if the format has nothing of the kind.
     fn properties(&self) -> Option<&Properties> {
+        None
+    }
+
+    /// Between two batches: appends what reading on depends on besides the bytes that follow. False if reading cannot begin here, or nowhere in
+    /// files of the format but at their beginning.
+    fn save(&self, _state: &mut Vec<u8>) -> bool {
+        false
+    }
+
+    /// Takes up what [`Self::save`] appended, before anything is read; `None` if that is nonsense.
+    fn restore(&mut self, _state: &[u8]) -> Option<()> {
         None
     }
 

@@ -22,6 +22,7 @@ use super::found::{Found, Row};
 use super::gvret;
 use super::input::Input;
 use super::issue::{Fault, Place};
+use super::seek;
 use super::zone::Zone;
 use cantap_trace::{TraceEvent, TraceRecord};
 
@@ -57,7 +58,28 @@ impl Decoder {
     }
 }
 
+/// What a file can be in, by number.
+const DIALECTS: [CsvDialect; 4] =
+    [CsvDialect::PythonCan, CsvDialect::Full, CsvDialect::Analyser, CsvDialect::Gvret];
+
 impl Decode for Decoder {
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        let dialect = self.dialect.map(|dialect| DIALECTS.iter().position(|known| *known == dialect));
+        self.no_head.is_empty()
+            && self.error_frames.is_over()
+            && seek::save(&(dialect, self.analyser.state(), &self.gvret), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        let (dialect, analyser): (Option<Option<usize>>, _);
+        (dialect, analyser, self.gvret) = seek::load(state)?;
+        self.dialect = match dialect {
+            Some(number) => Some(*DIALECTS.get(number?)?),
+            None => None,
+        };
+        self.analyser.restore(analyser)
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(found) = self.error_frames.next() {
             return Ok(found);

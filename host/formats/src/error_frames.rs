@@ -36,6 +36,11 @@ impl ErrorFrames {
         self.records.is_empty()
     }
 
+    /// Whether there is nothing left to return or report.
+    pub(super) fn is_over(&self) -> bool {
+        self.is_empty() && self.untold == 0
+    }
+
     /// What to return before anything else is read.
     pub(super) fn next(&mut self) -> Option<Found> {
         if let Some(record) = self.records.pop_front() {

@@ -8,9 +8,10 @@ use super::issue::Fault;
 use super::left_out::LeftOut;
 use super::text;
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use serde::{Deserialize, Serialize};
 
 /// Reads the rows.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 pub(crate) struct RowDecoder {
     has_direction: bool,
 }

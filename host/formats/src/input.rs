@@ -1,6 +1,8 @@
 //! Where a reader's bytes come from: a file or standard input, plain or compressed, finished or
 //! still growing. One buffer of bounded size; lines are slices of it.
 
+mod blocks;
+
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read};
@@ -11,6 +13,7 @@ use super::carriage_return::{self, ToLineFeed};
 use super::compression::{self, Compression};
 use super::found::Found;
 use super::issue::{Fault, Place};
+use super::seek::Blocks;
 use super::utf16::{self, ToUtf8, Utf16};
 use super::whole::{MAX_MEMORY_BYTES, Whole};
 use super::zone::Zone;
@@ -46,6 +49,8 @@ pub(crate) struct Input {
     stop: Box<dyn Fn() -> bool + Send>,
     /// The same file again, if it is a plain one: for formats read with random access.
     file: Option<File>,
+    /// Digests of what is read of it, if there is an index.
+    blocks: Option<Blocks>,
     /// Whether its bytes are the file's own, neither decompressed nor converted.
     is_as_it_is: bool,
     zone: Zone,
@@ -103,6 +108,7 @@ impl Input {
             damage: None,
             stop: Box::new(|| false),
             file: None,
+            blocks: None,
             is_as_it_is: true,
             zone: Zone::default(),
             long: Vec::new(),
@@ -279,6 +285,9 @@ impl Input {
         if (self.stop)() {
             self.ended = true;
             return Ok(false);
+        }
+        if self.blocks.is_some() {
+            return self.fill_block();
         }
         loop {
             match self.source.read(&mut self.buffer[self.end..]) {

@@ -1,10 +1,14 @@
 //! Interface names (`can0`, `vcan1`, `OBD`) as channel numbers.
 
+use serde::{Deserialize, Serialize};
+
 /// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count, and so is `CAN 1`, as programs
 /// that count so write it; a name without a number, or with a number already used by another name, gets the next free one.
-#[derive(Default)]
+#[derive(Default, Serialize, Deserialize)]
 pub(crate) struct Interfaces {
     known: Vec<(Vec<u8>, u8)>,
+    /// The place of the last one asked for.
+    #[serde(skip)]
     last: usize,
 }
 

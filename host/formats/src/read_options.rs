@@ -1,6 +1,7 @@
 //! How a trace is read.
 
 use super::Format;
+use super::seek::IndexFolder;
 use super::table::Columns;
 use super::zone::Zone;
 
@@ -18,4 +19,6 @@ pub struct ReadOptions {
     pub zone: Zone,
     /// Which columns of a table mean what. If they are given and no format is, files are tables.
     pub columns: Option<Columns>,
+    /// Where indexes of large files are kept and looked for, for [`TraceReader::within`](crate::TraceReader::within); none without.
+    pub index: Option<IndexFolder>,
 }

@@ -1,6 +1,9 @@
 //! Reading a trace of any format as a stream.
 
+mod indexed;
+
 use std::borrow::Cow;
+use std::collections::BTreeSet;
 use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
@@ -15,6 +18,7 @@ use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
+use super::seek::Indexing;
 use super::spec::FormatSpec;
 use cantap_trace::{PlainFrame, TraceRecord, clean};
 
@@ -67,6 +71,10 @@ pub struct TraceReader {
     /// The format according to the name, if the content is in another one.
     named: Option<Format>,
     head: Vec<u8>,
+    /// The index that is made or used, if there is one.
+    indexing: Option<Box<Indexing>>,
+    /// Channels of records that were passed over.
+    passed_channels: BTreeSet<u8>,
 }
 
 /// What is wrong with a line of text that has NUL bytes, such as after a crash.
@@ -169,8 +177,10 @@ fn recognise(
         }
     };
     input.set_zone(options.zone.clone());
-    let reader = TraceReader::new(name.into(), format, input, options);
-    Ok(TraceReader { named, ..reader })
+    let indexing = Indexing::of(path, format, &input, options).map(Box::new);
+    let mut reader = TraceReader::new(name.into(), format, input, options);
+    (reader.named, reader.indexing) = (named, indexing);
+    Ok(reader)
 }
 
 impl TraceReader {
@@ -194,6 +204,8 @@ impl TraceReader {
             records: 0,
             named: None,
             head,
+            indexing: None,
+            passed_channels: BTreeSet::new(),
         }
     }
 
@@ -220,7 +232,7 @@ impl TraceReader {
         self.named
     }
 
-    /// How many records have been decoded so far, some of which may not have been handed out.
+    /// How many records have been decoded so far, some of which may not have been handed out, or were left out by [`Self::within`].
     pub fn records(&self) -> u64 {
         self.records
     }
@@ -306,13 +318,22 @@ impl TraceReader {
         let Some(after) = self.after.take() else {
             self.batch.clear();
             self.at = 0;
-            self.after = self.decoder.batch(&mut self.input, &mut self.batch).transpose();
+            self.after = match self.step() {
+                Ok(()) => self.decoder.batch(&mut self.input, &mut self.batch).transpose(),
+                Err(error) => Some(Err(error)),
+            };
             self.records += self.batch.len() as u64;
+            if let Some(indexing) = &mut self.indexing {
+                indexing.note(&[], &self.batch);
+            }
             return Beyond::Batch;
         };
         match after {
             Ok(Found::Record(record)) => {
                 self.records += 1;
+                if let Some(indexing) = &mut self.indexing {
+                    indexing.note(&[], &[record]);
+                }
                 self.batch.push(record);
                 Beyond::Batch
             }
@@ -342,6 +363,7 @@ impl TraceReader {
                     return Beyond::Issue(self.issue(Place::Line(line), nul()));
                 }
                 self.ended = true;
+                self.keep_index();
                 if let Some(damage) = self.input.damage() {
                     let fault = Fault::malformed("undamaged compressed data to the end", damage.as_bytes());
                     return Beyond::Issue(self.issue(Place::Offset(self.input.offset()), fault));
@@ -361,6 +383,7 @@ impl TraceReader {
                 Beyond::End
             }
             Err(error) => {
+                self.keep_index();
                 let place = Place::Offset(self.input.offset());
                 Beyond::Issue(self.issue(place, Fault::Io(error)))
             }
@@ -402,8 +425,14 @@ impl TraceReader {
             }
             self.batch.clear();
             self.at = 0;
-            self.after = self.decoder.mixed(&mut self.input, frames, &mut self.batch).transpose();
+            self.after = match self.step() {
+                Ok(()) => self.decoder.mixed(&mut self.input, frames, &mut self.batch).transpose(),
+                Err(error) => Some(Err(error)),
+            };
             self.records += (frames.len() + self.batch.len()) as u64;
+            if let Some(indexing) = &mut self.indexing {
+                indexing.note(frames, &self.batch);
+            }
             if !frames.is_empty() {
                 break;
             }

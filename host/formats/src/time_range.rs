@@ -14,6 +14,15 @@ pub enum TimePoint {
     AfterFirst(i64),
 }
 
+impl TimePoint {
+    fn time_ns(self, first_ns: i64) -> i64 {
+        match self {
+            Self::At(time_ns) => time_ns,
+            Self::AfterFirst(offset_ns) => first_ns.saturating_add(offset_ns),
+        }
+    }
+}
+
 /// Not a point in time.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
@@ -74,15 +83,24 @@ impl TimeRange {
         Self { start, end, first_ns: None }
     }
 
+    /// Whether it is the whole trace.
+    pub fn is_all(&self) -> bool {
+        self.start.is_none() && self.end.is_none()
+    }
+
     /// Whether a record is in it. The first record passed is taken as the trace's first.
     pub fn contains(&mut self, record: &TraceRecord) -> bool {
         let first_ns = *self.first_ns.get_or_insert(record.time_ns);
-        let absolute = |point| match point {
-            TimePoint::At(time_ns) => time_ns,
-            TimePoint::AfterFirst(offset_ns) => first_ns.saturating_add(offset_ns),
-        };
-        self.start.is_none_or(|start| record.time_ns >= absolute(start))
-            && self.end.is_none_or(|end| record.time_ns < absolute(end))
+        self.start.is_none_or(|start| record.time_ns >= start.time_ns(first_ns))
+            && self.end.is_none_or(|end| record.time_ns < end.time_ns(first_ns))
+    }
+
+    /// Learns the time of the trace's first record, which may not be passed. From when and up to before when that is; `None` if it is the whole
+    /// trace.
+    pub(crate) fn beginning_at(&mut self, first_ns: i64) -> Option<(i64, i64)> {
+        let first_ns = *self.first_ns.get_or_insert(first_ns);
+        let time_ns = |point: Option<TimePoint>, open| point.map_or(open, |point| point.time_ns(first_ns));
+        (!self.is_all()).then(|| (time_ns(self.start, i64::MIN), time_ns(self.end, i64::MAX)))
     }
 }
 

@@ -6,6 +6,7 @@
 
 mod decode;
 mod encode;
+mod layout;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
@@ -34,6 +35,9 @@ pub enum TrcVersion {
 }
 
 impl TrcVersion {
+    /// The oldest first.
+    const ALL: [Self; 6] = [Self::V1_0, Self::V1_1, Self::V1_2, Self::V1_3, Self::V2_0, Self::V2_1];
+
     /// The name in the file's header; 1.0 has none.
     fn name(self) -> &'static str {
         match self {

@@ -31,6 +31,8 @@ pub mod bus_hints;
 #[cfg(feature = "buses")]
 pub mod bus_off;
 #[cfg(feature = "buses")]
+pub mod cache;
+#[cfg(feature = "buses")]
 pub mod changing;
 #[cfg(feature = "buses")]
 pub mod channel_bitrate;

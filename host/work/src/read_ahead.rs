@@ -5,6 +5,7 @@ use std::thread::{self, JoinHandle};
 use std::{io, panic, vec};
 
 use cantap::TraceRecord;
+use cantap_formats::time_range::TimeRange;
 use cantap_formats::{LeftOut, NothingRead, ReadIssue, TraceReader};
 
 use crate::missing::Missing;
@@ -77,6 +78,14 @@ impl ReadAhead {
     pub fn end_when(&mut self, stop: fn() -> bool) {
         if let Source::Waiting(reader) = &mut self.source {
             reader.end_when(stop);
+        }
+    }
+
+    /// Leaves out what an index shows to be outside of a range; see [`TraceReader::within`].
+    pub fn within(&mut self, range: &mut TimeRange) -> io::Result<()> {
+        match &mut self.source {
+            Source::Waiting(reader) => reader.within(range),
+            _ => Ok(()),
         }
     }
 

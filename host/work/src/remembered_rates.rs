@@ -10,7 +10,7 @@ use std::path::PathBuf;
 
 use cantap::Channel;
 
-use crate::atomic_file;
+use crate::{atomic_file, cache};
 
 /// The file's name within the folder of cantap.
 const NAME: &str = "bit-rates.json";
@@ -18,22 +18,6 @@ const NAME: &str = "bit-rates.json";
 const MOST_BYTES: u64 = 1 << 20;
 /// With more entries, it starts anew.
 const MOST_ENTRIES: usize = 4_096;
-
-/// Where a user's programs keep what can be computed again: `XDG_CACHE_HOME` or `~/.cache`, on macOS
-/// `~/Library/Caches`, on Windows `%LOCALAPPDATA%`.
-fn cache_folder() -> Option<PathBuf> {
-    let variable = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let base = variable("XDG_CACHE_HOME").or_else(|| {
-        if cfg!(windows) {
-            variable("LOCALAPPDATA")
-        } else if cfg!(target_os = "macos") {
-            Some(variable("HOME")?.join("Library/Caches"))
-        } else {
-            Some(variable("HOME")?.join(".cache"))
-        }
-    });
-    Some(base?.join("cantap"))
-}
 
 /// The bit rates that were found on devices' channels.
 pub struct RememberedRates {
@@ -44,7 +28,7 @@ pub struct RememberedRates {
 impl RememberedRates {
     /// Those of this user.
     pub fn of_user() -> Self {
-        Self { path: cache_folder().map(|folder| folder.join(NAME)) }
+        Self { path: cache::folder().map(|folder| folder.join(NAME)) }
     }
 
     /// Those in this file.

@@ -27,6 +27,8 @@ mod memory;
 mod monitor;
 #[cfg(feature = "bench")]
 mod protocols;
+#[cfg(feature = "bench")]
+mod seek;
 #[cfg(all(feature = "bench", unix))]
 mod serve;
 #[cfg(feature = "bench")]
@@ -49,6 +51,8 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
+    /// A second out of a large trace, with an index and without.
+    Seek,
     /// Sizes and times of Parquet, compared with trace formats.
     Columns,
     /// How much memory the command occupies with long traces, in every format.
@@ -126,6 +130,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
+            Subject::Seek => seek::run(args.quick)?,
             Subject::Columns => columns::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,

@@ -12,6 +12,7 @@ use crate::database_args::DatabaseArgs;
 use crate::input::FollowArgs;
 use crate::live_args::LiveArgs;
 use crate::protocols::ProtocolArgs;
+use crate::range_args::RangeArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -87,6 +88,8 @@ pub struct Args {
     /// Do not report what is wrong with usable databases, and which of them replaces another.
     #[arg(short, long)]
     pub quiet: bool,
+    #[command(flatten)]
+    pub range: RangeArgs,
     #[command(flatten)]
     pub read: FollowArgs,
 }

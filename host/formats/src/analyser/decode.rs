@@ -22,6 +22,22 @@ pub(crate) struct RowDecoder {
 }
 
 impl RowDecoder {
+    /// What reading rows depends on.
+    pub(crate) fn state(&self) -> (u8, i64, &[Option<usize>]) {
+        (self.separator, self.start_ns, &self.places)
+    }
+
+    /// Takes that up; `None` if it is nonsense.
+    pub(crate) fn restore(
+        &mut self,
+        (separator, start_ns, places): (u8, i64, Vec<Option<usize>>),
+    ) -> Option<()> {
+        let is_place = |place: &usize| *place <= usize::from(u16::MAX);
+        places.iter().flatten().all(is_place).then_some(())?;
+        (self.separator, self.start_ns, self.places) = (separator, start_ns, places);
+        Some(())
+    }
+
     /// `zone` is the zone of the file's date.
     pub(crate) fn new(zone: &Zone) -> Self {
         Self { zone: zone.clone(), ..Self::default() }

@@ -9,6 +9,7 @@ use super::super::event_text;
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::Fault;
+use super::super::seek;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
@@ -54,6 +55,17 @@ impl Decoder {
 }
 
 impl Decode for Decoder {
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        let Self { decimal, relative, date_ns, block_ns, blocks, base_ns, zone: _ } = self;
+        seek::save(&(decimal, relative, date_ns, block_ns, blocks, base_ns), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.decimal, self.relative, self.date_ns, self.block_ns, self.blocks, self.base_ns) =
+            seek::load(state)?;
+        Some(())
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
@@ -101,7 +113,7 @@ impl Decoder {
             self.relative = has(b"relative");
         } else if begins(line, "begin triggerblock") {
             // Later blocks belong to the same measurement: its times continue.
-            self.blocks += 1;
+            self.blocks = self.blocks.saturating_add(1);
             let stamp = line["begin triggerblock".len()..].trim_ascii();
             if self.blocks == 1 && !stamp.is_empty() {
                 self.block_ns = Some(date(stamp, &self.zone)?);

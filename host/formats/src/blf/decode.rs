@@ -2,17 +2,19 @@
 
 use std::io;
 
-use flate2::{Decompress, FlushDecompress, Status};
+use flate2::Decompress;
 
 use super::super::calendar::Date;
 use super::super::codec::{BATCH, Decode, PLAIN_BATCH, REQUESTS_TO_SEND};
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
+use super::super::seek;
 use super::super::zone::Zone;
 use super::containers::{AHEAD_BYTES, Containers};
 use super::kinds::{group, is_left_out};
 use super::object::{Content, event, u16_at, u32_at, u64_at};
+use super::unpack::{inflate, skip_to_object};
 use super::{
     BASE_HEADER_BYTES, CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
     DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HEADER_BYTES,
@@ -117,8 +119,8 @@ impl Decode for Decoder {
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             self.frames(records);
-            // Records that are there do not wait for more input.
-            if records.len() >= BATCH || input.may_wait() && !records.is_empty() {
+            // Records that are there do not wait for more input; and between two containers is a place to read on from.
+            if records.len() >= BATCH || (input.may_wait() || self.is_between()) && !records.is_empty() {
                 return Ok(None);
             }
             match self.next(input)? {
@@ -129,6 +131,25 @@ impl Decode for Decoder {
                 return Ok(None);
             }
         }
+    }
+
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        /// A longer object is not begun before a place.
+        const MOST_BEGUN_BYTES: usize = 4096;
+        let begun = &self.objects[self.at..];
+        self.fault.is_none()
+            && self.is_between()
+            && begun.len() <= MOST_BEGUN_BYTES
+            && seek::save(
+                &(self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, begun),
+                state,
+            )
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, self.objects) =
+            seek::load(state)?;
+        Some(())
     }
 
     fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<bool> {
@@ -167,6 +188,16 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
+    /// Whether nothing more can be read without the next container: at most the beginning of an object is left.
+    fn is_between(&self) -> bool {
+        let rest = &self.objects[self.at..];
+        rest.len() < BASE_HEADER_BYTES || {
+            let (header_len, len) = (usize::from(u16_at(rest, 4)), u32_at(rest, 8) as usize);
+            let is_object = rest.starts_with(OBJECT_MAGIC) && header_len <= len;
+            is_object && (BASE_HEADER_BYTES..=MAX_ITEM_BYTES).contains(&len) && rest.len() < len
+        }
+    }
+
     /// Reads the file's header. A file without one is still read, from the first object on.
     fn head(&mut self, input: &mut Input) -> io::Result<Option<Fault>> {
         self.started = true;
@@ -438,48 +469,6 @@ impl Decoder {
                 self.at = self.objects.len();
                 Object::Issue(Fault::malformed(EXPECTED_OBJECT, &found))
             }
-        }
-    }
-}
-
-/// Skips to the next LOBJ in the file, or to its end.
-fn skip_to_object(input: &mut Input) -> io::Result<()> {
-    loop {
-        let bytes = input.peek(OBJECT_MAGIC.len())?;
-        if bytes.len() < OBJECT_MAGIC.len() {
-            let rest = bytes.len();
-            input.consume(rest);
-            return Ok(());
-        }
-        if let Some(at) = memchr::memmem::find(bytes, OBJECT_MAGIC) {
-            input.consume(at);
-            return Ok(());
-        }
-        let searched = bytes.len() + 1 - OBJECT_MAGIC.len();
-        input.consume(searched);
-    }
-}
-
-/// Appends the decompressed content of a zlib stream; false if it is damaged, cut or implausibly large.
-fn inflate(decompressor: &mut Decompress, mut data: &[u8], expected_len: usize, out: &mut Vec<u8>) -> bool {
-    const STEP_BYTES: usize = 256 * 1024;
-    let limit = out.len() + MAX_ITEM_BYTES;
-    decompressor.reset(true);
-    out.reserve(expected_len.min(MAX_ITEM_BYTES));
-    loop {
-        let (before_in, before_out) = (decompressor.total_in(), decompressor.total_out());
-        let status = decompressor.decompress_vec(data, out, FlushDecompress::None);
-        let used = (decompressor.total_in() - before_in) as usize;
-        data = &data[used..];
-        match status {
-            Ok(Status::StreamEnd) => return true,
-            Ok(_) if out.len() == out.capacity() && out.len() < limit => out.reserve(STEP_BYTES),
-            Ok(_) if used > 0 || decompressor.total_out() > before_out => {
-                if out.len() >= limit {
-                    return false;
-                }
-            }
-            _ => return false,
         }
     }
 }

@@ -10,6 +10,7 @@ use super::super::found::Found;
 use super::super::input::Input;
 use super::super::interfaces::Interfaces;
 use super::super::issue::Fault;
+use super::super::seek;
 use super::super::text::{self, NS_PER_S};
 use super::lengths::Lengths;
 use cantap_trace::fd::{FD_MAX_BYTES, FLAG_BRS, FLAG_ESI, FLAG_FDF};
@@ -74,6 +75,16 @@ impl Decode for Decoder {
             return Ok(Found::Note("the last line has no end: it may have been longer"));
         }
         Ok(Found::End)
+    }
+
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        let is_between = self.error_frames.is_over() && self.note.is_none() && !self.end_missing;
+        is_between && seek::save(&(&self.interfaces, &self.lengths, self.untimed), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.interfaces, self.lengths, self.untimed) = seek::load(state)?;
+        Some(())
     }
 
     /// Lines exactly as candump writes them are read in place in the buffer; the others one by one.

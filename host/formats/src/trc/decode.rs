@@ -11,16 +11,15 @@ use super::super::event_text;
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::Fault;
+use super::super::seek;
 use super::super::text;
 use super::super::zone::Zone;
+use super::layout::{Layout, MAX_COLUMNS};
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 const NS_PER_MS: i64 = 1_000_000;
-
-/// Most columns a row can have before its data.
-const MAX_COLUMNS: usize = 16;
 
 /// Reads TRC.
 pub(crate) struct Decoder {
@@ -48,57 +47,6 @@ enum Row {
     Nothing,
 }
 
-/// The content of each column, counted from 0.
-#[derive(Clone, Copy, Debug)]
-struct Layout {
-    offset: usize,
-    kind: Option<usize>,
-    bus: Option<usize>,
-    id: usize,
-    direction: Option<usize>,
-    len: usize,
-    /// The length is a number of bytes, not the bus's length code.
-    len_is_bytes: bool,
-    data: usize,
-}
-
-impl Layout {
-    /// The fixed columns of version 1, and those of 2.1 unless the header says otherwise.
-    fn of(version: TrcVersion) -> Self {
-        let fixed = |kind, bus, id, len| {
-            let direction = kind;
-            Self { offset: 1, kind, bus, id, direction, len, len_is_bytes: false, data: len + 1 }
-        };
-        match version {
-            TrcVersion::V1_0 => fixed(None, None, 2, 3),
-            TrcVersion::V1_1 => fixed(Some(2), None, 3, 4),
-            TrcVersion::V1_2 => fixed(Some(3), Some(2), 4, 5),
-            TrcVersion::V1_3 => fixed(Some(3), Some(2), 4, 6),
-            TrcVersion::V2_0 => Self::named(b"N,O,T,I,d,l,D").unwrap_or(fixed(None, None, 3, 5)),
-            TrcVersion::V2_1 => Self::named(b"N,O,T,B,I,d,R,L,D").unwrap_or(fixed(None, None, 4, 7)),
-        }
-    }
-
-    /// The columns that `$COLUMNS` names.
-    fn named(names: &[u8]) -> Option<Self> {
-        let names: Vec<&[u8]> = names.split(|byte| *byte == b',').map(<[u8]>::trim_ascii).collect();
-        let find = |name: &[u8]| names.iter().position(|known| *known == name);
-        if names.len() > MAX_COLUMNS {
-            return None;
-        }
-        Some(Self {
-            offset: find(b"O")?,
-            kind: find(b"T"),
-            bus: find(b"B"),
-            id: find(b"I")?,
-            direction: find(b"d"),
-            len: find(b"L").or_else(|| find(b"l"))?,
-            len_is_bytes: find(b"L").is_none(),
-            data: find(b"D")?,
-        })
-    }
-}
-
 impl Default for Decoder {
     fn default() -> Self {
         let version = TrcVersion::V1_0;
@@ -124,6 +72,22 @@ impl Decoder {
 }
 
 impl Decode for Decoder {
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        let Self { version, start_ns, has_start, has_layout, has_rows, layout, table, told, zone: _ } = self;
+        let version = TrcVersion::ALL.iter().position(|known| known == version);
+        told.is_none()
+            && seek::save(&(version, start_ns, has_start, has_layout, has_rows, layout, table), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        let (version, layout): (Option<usize>, Layout);
+        (version, self.start_ns, self.has_start, self.has_layout, self.has_rows, layout, self.table) =
+            seek::load(state)?;
+        self.version = *TrcVersion::ALL.get(version?)?;
+        self.layout = Some(layout).filter(Layout::is_of_a_row)?;
+        Some(())
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();

@@ -77,7 +77,7 @@ impl Windows {
         cmd!(shell, "{COMPILER} -O1 -Wall -Werror -o {program} {pipe}").run()?;
         let windows = Self { folder, prefix, here: workspace::target().join("debug/cantap") };
         // Wine makes its own folder at the first start.
-        windows.ends_well(windows.command("cantap.exe", &["--version"]))?;
+        ends_well(windows.command("cantap.exe", &["--version"]))?;
         Ok(windows)
     }
 
@@ -93,16 +93,7 @@ impl Windows {
     fn cantap(&self, line: &str) -> Result<String> {
         println!("$ wine cantap.exe {line}");
         let arguments: Vec<&str> = line.split(' ').collect();
-        self.ends_well(self.command("cantap.exe", &arguments)).with_context(|| format!("cantap.exe {line}"))
-    }
-
-    /// What it printed to standard output, or what it printed to standard error as the error.
-    fn ends_well(&self, mut command: Command) -> Result<String> {
-        let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().context("wine")?;
-        let output = wait(child)?;
-        let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).replace('\r', "");
-        ensure!(output.status.success(), "{}: {}", output.status, text(&output.stderr));
-        Ok(text(&output.stdout))
+        ends_well(self.command("cantap.exe", &arguments)).with_context(|| format!("cantap.exe {line}"))
     }
 
     /// What it records is what this system reads, and both write the same bytes of it.
@@ -199,6 +190,15 @@ impl Windows {
         let text = cmd!(shell, "{here} stats {file}").quiet().read()?;
         Ok(text.lines().next().unwrap_or_default().to_owned())
     }
+}
+
+/// What it printed to standard output, or what it printed to standard error as the error.
+fn ends_well(mut command: Command) -> Result<String> {
+    let child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().context("wine")?;
+    let output = wait(child)?;
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).replace('\r', "");
+    ensure!(output.status.success(), "{}: {}", output.status, text(&output.stderr));
+    Ok(text(&output.stdout))
 }
 
 fn says(text: &str, what: &str) -> Result<()> {

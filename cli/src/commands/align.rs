@@ -61,12 +61,12 @@ pub struct Args {
 /// A time with a sign, in nanoseconds.
 fn shift(text: &str) -> Result<i64, String> {
     // A longer one would take any time out of range.
-    const MOST: Duration = Duration::from_secs(100 * 365 * 86_400);
+    const MOST: Duration = Duration::from_hours(100 * 365 * 24);
     let (sign, digits) = match text.strip_prefix('-') {
         Some(digits) => (-1, digits),
         None => (1, text.strip_prefix('+').unwrap_or(text)),
     };
-    let time = duration(digits).map_err(|error| error.to_string())?;
+    let time = duration(digits)?;
     let ns = i64::try_from(time.as_nanos()).ok().filter(|_| time <= MOST);
     ns.map(|ns| sign * ns).ok_or_else(|| "clocks differ by 100 years at most".to_owned())
 }

@@ -153,13 +153,11 @@ impl Decoder {
                 _ => None,
             });
         }
-        match pending.parts.len {
-            Some(len) => Err(Fault::malformed(format!("{len} data bytes behind the identifier"), b"")),
-            None => {
-                self.notes.push(NO_BYTES);
-                Ok(None)
-            }
+        if let Some(len) = pending.parts.len {
+            return Err(Fault::malformed(format!("{len} data bytes behind the identifier"), b""));
         }
+        self.notes.push(NO_BYTES);
+        Ok(None)
     }
 
     fn labelled(&mut self, line: &[u8]) -> Result<Line, Fault> {

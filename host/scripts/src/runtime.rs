@@ -121,28 +121,20 @@ impl Runtime {
 
     /// Adds something that the script reacts to.
     pub fn react<R>(&self, add: impl FnOnce(&mut Handlers) -> R) -> Result<R> {
-        self.has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
+        has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
         Ok(self.with_handlers(add))
     }
 
     /// Adds what answers for the script; returns its place.
     pub fn serve_with(&self, channel: Channel, name: String, server: Server) -> Result<usize> {
         let mut servers = self.servers.borrow_mut();
-        self.has_place(servers.len(), "servers")?;
+        has_place(servers.len(), "servers")?;
         Ok(servers.add(channel, name, server))
-    }
-
-    fn has_place(&self, len: usize, what: &str) -> Result<()> {
-        if len < MAX_WAITING {
-            return Ok(());
-        }
-        Err(format!("{MAX_WAITING} {what} are waiting already; add none each time that something happens")
-            .into())
     }
 
     /// Calls a function after a time, then again if it is repeated; returns its handle.
     pub fn after(&self, delay_ns: u64, repeated: Option<Repeated>, call: FnPtr) -> Result<u32> {
-        self.has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
+        has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
         let State { handlers, now_ns, random, .. } = &mut *self.state.borrow_mut();
         Ok(handlers.at(*now_ns + delay_ns, repeated, call, random))
     }
@@ -474,4 +466,12 @@ impl Runtime {
 /// The error that ends a script whose bus is gone.
 fn ended() -> EvalAltResult {
     EvalAltResult::ErrorTerminated(ENDED.into(), rhai::Position::NONE)
+}
+
+/// Whether there is room for one more of what waits.
+fn has_place(len: usize, what: &str) -> Result<()> {
+    if len < MAX_WAITING {
+        return Ok(());
+    }
+    Err(format!("{MAX_WAITING} {what} are waiting already; add none each time that something happens").into())
 }

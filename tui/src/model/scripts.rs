@@ -111,11 +111,13 @@ impl Scripts {
         }
         match outcome {
             Outcome::Passed => {
-                self.say(LineKind::Note, &format!("{script}: ok {name} ({milliseconds:.3} ms)"))
+                self.say(LineKind::Note, &format!("{script}: ok {name} ({milliseconds:.3} ms)"));
             }
             Outcome::Failed(reason) => {
                 // The verdict below its frames is in sight.
-                trace.iter().for_each(|line| self.say(LineKind::Log, &format!("    {line}")));
+                for line in trace {
+                    self.say(LineKind::Log, &format!("    {line}"));
+                }
                 let verdict = format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}");
                 self.say(LineKind::Fault, &verdict);
             }

@@ -1,5 +1,7 @@
 //! Scripts: the list with states and verdicts, what they have said, and the device's gateway.
 
+use std::fmt::Write;
+
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::Line;
@@ -77,7 +79,7 @@ fn draw_output(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) 
     let mut heading = format!("Output  {} sent, {} received", counts.sent, counts.received);
     for (count, of) in [(counts.waiting, "waiting"), (counts.not_sent, "NOT SENT"), (counts.lost, "LOST")] {
         if count > 0 {
-            heading.push_str(&format!(", {count} {of}"));
+            let _ = write!(heading, ", {count} {of}");
         }
     }
     let room = usize::from(area.height).saturating_sub(1);
@@ -87,7 +89,7 @@ fn draw_output(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) 
     app.output_above = app.output_above.min(output.len().saturating_sub(room));
     let end = output.len() - app.output_above;
     if app.output_above > 0 {
-        heading.push_str(&format!("  ({} newer lines below, End)", app.output_above));
+        let _ = write!(heading, "  ({} newer lines below, End)", app.output_above);
     }
     let mut lines = Vec::new();
     // As many of the newest as have room, each whole.

@@ -32,7 +32,7 @@ impl RowDecoder {
         &mut self,
         (separator, start_ns, places): (u8, i64, Vec<Option<usize>>),
     ) -> Option<()> {
-        let is_place = |place: &usize| *place <= usize::from(u16::MAX);
+        let is_place = |place: &usize| u16::try_from(*place).is_ok();
         places.iter().flatten().all(is_place).then_some(())?;
         (self.separator, self.start_ns, self.places) = (separator, start_ns, places);
         Some(())

@@ -14,7 +14,7 @@ const MOST_BYTES: u64 = 64 << 20;
 /// Of all together. Those that were not used for longest go first.
 const MOST_TOGETHER_BYTES: u64 = 256 << 20;
 /// Smaller traces are read as quickly without.
-const LEAST_TRACE_BYTES: u64 = if cfg!(test) { 0 } else { 32 << 20 };
+const LEAST_TRACE_BYTES: u64 = if cfg!(test) { 1 } else { 32 << 20 };
 
 const SUFFIX: &str = "index";
 
@@ -41,8 +41,8 @@ impl IndexFolder {
         hash.update(trace.as_os_str().as_encoded_bytes());
         hash.update([0]);
         hash.update(how);
-        let name: String = hash.finalize()[..16].iter().map(|byte| format!("{byte:02x}")).collect();
-        Some(self.0.join(format!("{name}.{SUFFIX}")))
+        let name = hash.finalize()[..16].iter().fold(0, |name: u128, byte| name << 8 | u128::from(*byte));
+        Some(self.0.join(format!("{name:032x}.{SUFFIX}")))
     }
 
     /// The index in a file, if there is one that can be used.

@@ -148,14 +148,13 @@ impl Indexing {
             }
             _ => None,
         };
-        self.index = match usable {
-            Some(index) => index,
-            None => {
-                self.range = None;
-                self.is_learning = true;
-                self.open = Open::of(reading);
-                Index::beginning_at(first.clone())
-            }
+        self.index = if let Some(index) = usable {
+            index
+        } else {
+            self.range = None;
+            self.is_learning = true;
+            self.open = Open::of(reading);
+            Index::beginning_at(first.clone())
         };
         reading.input.set_blocks(Some(std::mem::take(&mut self.index.blocks)));
         reading.input.seek_to(first.offset, 0)?;

@@ -98,7 +98,9 @@ fn file(format: Format, records: &[TraceRecord]) -> Vec<u8> {
     let output = Output::Stream(Box::new(memory.clone()));
     let mut writer = Box::new(FileWriter::new(output, format, &WriteOptions::default()));
     for few in records.chunks(40) {
-        few.iter().for_each(|record| writer.write(record).unwrap());
+        for record in few {
+            writer.write(record).unwrap();
+        }
         writer.flush().unwrap();
     }
     writer.finish().unwrap();

@@ -115,6 +115,10 @@ impl LiveRun<'_> {
                 _ => break,
             }
         }
+        // However short the run is.
+        if keys.is_none() {
+            self.results.without_keys(&self.nodes, self.now_ns);
+        }
         while duration.is_none_or(|duration| self.began.elapsed() < duration) && !self.is_over() && goes_on()
         {
             match &mut keys {

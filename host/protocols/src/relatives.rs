@@ -150,7 +150,7 @@ impl Relatives {
         if self.guard.toggled >= ENOUGH {
             found.push(Relative::Cal);
         }
-        found.extend(self.rv_c.found());
+        found.extend(self.rv_c.found().map(|(examples, groups)| Relative::RvC { examples, groups }));
         found
     }
 }

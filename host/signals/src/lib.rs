@@ -19,6 +19,7 @@ mod decoder;
 pub mod encode;
 mod fault;
 pub mod file;
+mod file_kind;
 mod j1939;
 pub mod kcd;
 mod layout;
@@ -39,6 +40,8 @@ mod validate;
 mod xml;
 
 use std::path::Path;
+
+use file_kind::FileKind;
 
 pub use container::{ContainedPdu, Container, ContainerHeader, InPdu, NotDecoded, Part};
 pub use decoder::{Decoder, MessageRef, Override, Source};
@@ -83,49 +86,6 @@ pub fn load(path: &Path) -> Result<Database, DatabaseError> {
 pub fn parse(name: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     let (name, bytes) = packed::unpack(name, bytes, None)?;
     FileKind::of(&name, Path::new(&name))?.parse(&name, &bytes, None)
-}
-
-/// The kinds of database files.
-#[derive(Clone, Copy)]
-enum FileKind {
-    Dbc,
-    Kcd,
-    Sym,
-    Arxml,
-    Toml,
-}
-
-impl FileKind {
-    fn of(file: &str, path: &Path) -> Result<Self, DatabaseError> {
-        let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
-        match suffix.to_ascii_lowercase().as_str() {
-            "dbc" => Ok(Self::Dbc),
-            "kcd" => Ok(Self::Kcd),
-            "sym" => Ok(Self::Sym),
-            "arxml" => Ok(Self::Arxml),
-            "toml" => Ok(Self::Toml),
-            _ => Err(DatabaseError::UnknownKind { file: file.to_owned() }),
-        }
-    }
-
-    const fn is_toml(self) -> bool {
-        matches!(self, Self::Toml)
-    }
-
-    /// Whether a file may describe several buses.
-    const fn has_buses(self) -> bool {
-        matches!(self, Self::Kcd | Self::Arxml)
-    }
-
-    fn parse(self, file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
-        match self {
-            Self::Dbc => dbc::parse(file, bytes),
-            Self::Kcd => kcd::parse_bus(file, bytes, bus),
-            Self::Sym => sym::parse(file, bytes),
-            Self::Arxml => arxml::parse_bus(file, bytes, bus),
-            Self::Toml => file::parse(file, bytes),
-        }
-    }
 }
 
 /// Splits a file's path from the bus after it. `#` may also be part of an existing file's name.

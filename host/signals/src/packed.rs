@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use rawzip::ZipArchive;
 
-use super::FileKind;
 use super::fault::DatabaseError;
+use super::file_kind::FileKind;
 
 /// No database is longer: more is damage or malice.
 const MOST_BYTES: u64 = 256 << 20;

@@ -12,7 +12,7 @@ use cantap::{Channel, TraceEvent, TraceRecord};
 use super::super::model::{DeviceFigures, SourceState};
 use super::super::order::{Order, Repeated};
 use super::super::plan::Plan;
-use super::scripts::BOARD;
+use super::session_scripts::BOARD;
 use super::timed::{Ended, Timed};
 use super::{FIGURES_EVERY, SCRIPTS_WAIT, Source, Then, WAIT, lock};
 use cantap_work::advice;

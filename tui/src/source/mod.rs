@@ -7,6 +7,7 @@ mod autobaud;
 mod device;
 mod playback;
 mod scripts;
+mod session_scripts;
 mod timed;
 
 use std::fs::File;
@@ -22,7 +23,7 @@ use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
 use cantap_work::recording::{Older, Recording};
-use scripts::SessionScripts;
+use session_scripts::SessionScripts;
 use timed::Timed;
 
 /// The model, shared by the source thread and the display.

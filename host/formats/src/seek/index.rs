@@ -6,7 +6,7 @@ use sha2::{Digest as _, Sha256};
 use super::blocks::{Blocks, Digest};
 use super::identity::Identity;
 use super::{BLOCK_BYTES, STEP_BYTES};
-use crate::{Format, LeftOut, ReadOptions};
+use crate::LeftOut;
 
 /// Which cantap made it: decoders of another version may have another state, or read something else out of the same bytes. The number
 /// changes with whatever is stored, the version with everything else.
@@ -68,11 +68,6 @@ struct Stored<'a> {
     #[serde(borrow)]
     texts: Vec<&'a str>,
     digests: Vec<Digest>,
-}
-
-/// What an index depends on besides the file.
-pub(super) fn how(format: Format, options: &ReadOptions) -> String {
-    format!("{format:?}, {:?}, {:?}", options.zone, options.columns)
 }
 
 /// A text of the same content that stays; `None` if there are too many, or if it is not one of ours.

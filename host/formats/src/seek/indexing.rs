@@ -10,7 +10,7 @@ use cantap_trace::{PlainFrame, TraceRecord};
 use super::blocks::has_changed;
 use super::folder::IndexFolder;
 use super::identity::Identity;
-use super::index::{Index, Part, Place, how};
+use super::index::{Index, Part, Place};
 use crate::codec::Decode;
 use crate::input::Input;
 use crate::spec::FormatSpec;
@@ -88,6 +88,11 @@ impl Open {
         index.count(&mut part, [reading.notes, &self.notes], [reading.left_out, &self.left_out]);
         part
     }
+}
+
+/// What an index depends on besides the file.
+fn how(format: Format, options: &ReadOptions) -> String {
+    format!("{format:?}, {:?}, {:?}", options.zone, options.columns)
 }
 
 impl Indexing {

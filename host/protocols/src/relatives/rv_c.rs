@@ -3,7 +3,6 @@
 use cantap_trace::TraceFrame;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::Relative;
 use crate::j1939::Header;
 use crate::nmea2000;
 use crate::table::Table;
@@ -59,8 +58,8 @@ impl Signs {
         }
     }
 
-    /// Whether it is RV-C.
-    pub fn found(&self) -> Option<Relative> {
+    /// Up to three of its groups, and how many there were, if it is RV-C.
+    pub fn found(&self) -> Option<([Option<u32>; 3], u32)> {
         let is_one = self.groups.len() >= GROUPS_ENOUGH
             && self.own >= MESSAGES_ENOUGH
             && self.own > self.second / 2
@@ -72,12 +71,13 @@ impl Signs {
         groups.sort_unstable_by(|a, b| b.cmp(a));
         let mut examples = [None; 3];
         examples.iter_mut().zip(&groups).for_each(|(example, pgn)| *example = Some(*pgn));
-        Some(Relative::RvC { examples, groups: groups.len() as u32 })
+        Some((examples, groups.len() as u32))
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::Relative;
     use super::*;
     use crate::table;
 
@@ -86,7 +86,7 @@ mod tests {
         for frame in frames.iter().cycle().take(frames.len() * 4) {
             signs.take(&frame.parse().unwrap());
         }
-        signs.found()
+        signs.found().map(|(examples, groups)| Relative::RvC { examples, groups })
     }
 
     #[test]

@@ -166,7 +166,8 @@ fn so_many_frames_per_second_of_a_certificate_and_no_more() {
     while third.set_periodic(Channel::Can1, 0, Some(periodic(u32::MAX))).is_ok() {
         set += 1;
         first.time().unwrap();
-        assert!(set < 50, "entries that are set again and again");
+        // What was left of the last request is theirs, and one in each second that it takes.
+        assert!(set < 3 * MAX_SEND, "entries that are set again and again");
     }
 }
 

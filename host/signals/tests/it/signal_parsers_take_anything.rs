@@ -226,7 +226,8 @@ fn large_files_take_no_more_than_their_share() {
         if let Ok(database) = result {
             use_it(database);
         }
-        assert!(start.elapsed().as_secs() < 10, "{:.60} takes {:?}", text, start.elapsed());
+        // A second on an idle computer; only what grows with the square of the length takes this long.
+        assert!(start.elapsed().as_secs() < 120, "{:.60} takes {:?}", text, start.elapsed());
     }
     assert!(file::parse("x.toml", b"x = ").is_err());
     assert!(file::parse("x.toml", format!("x = {}", "[".repeat(100_000)).as_bytes()).is_err());

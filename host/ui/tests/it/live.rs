@@ -97,6 +97,7 @@ fn filters_and_bit_rates_are_changed_with_a_gap_and_refused_ones_leave_everythin
     let text = format!("{:03X}:7FF", id & 0x7FF);
     page.ask("filters", &json!({ "filters": [text] })).unwrap();
     page.until(|page| page.state["filters"] != json!([]));
+    page.until(|page| page.records.iter().any(|record| record.event == TraceEvent::GAP));
     let gap = page.records.len()
         - page.records.iter().rev().position(|record| record.event == TraceEvent::GAP).unwrap();
     page.until(|page| page.records.len() > gap + 50);

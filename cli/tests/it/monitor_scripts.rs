@@ -37,7 +37,7 @@ fn a_script_starts_only_when_the_view_takes_part_and_its_verdicts_are_shown() {
         folder.path(),
         "t.rhai",
         "fn test_vin() {\n log(\"asking\");\n check(request(\"7E0\", \"7E8\", [0x22, 0xF1, 0x90]).len() == 20, \"17 characters\");\n}\n\
-         fn test_wrong() { wait(\"20ms\"); check(1 == 2, \"one is two\"); }\n",
+         fn test_wrong() { wait(\"500ms\"); check(1 == 2, \"one is two\"); }\n",
     );
     let recording = folder.path().join("a.log");
     let line = format!("monitor -d virtual:car -b 500k --view scripts -o {}", recording.display());

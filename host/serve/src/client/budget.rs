@@ -36,7 +36,8 @@ impl Budget {
         let left = self.left.map_or(most, |(left, at)| {
             (left + rate * now.saturating_duration_since(at).as_secs_f64()).min(most)
         });
-        self.left = Some((left, now));
+        // Whoever has waited for the lock may have looked at the clock before: no time is counted twice.
+        self.left = Some((left, self.left.map_or(now, |(_, at)| at.max(now))));
         left
     }
 
@@ -44,8 +45,8 @@ impl Budget {
     pub fn take(&mut self, frames: usize, per_second: u32, now: Instant) -> bool {
         let left = self.settle(per_second, now);
         let is_enough = left >= frames as f64;
-        if is_enough {
-            self.left = Some((left - frames as f64, now));
+        if is_enough && let Some((left, _)) = &mut self.left {
+            *left -= frames as f64;
         }
         is_enough
     }
@@ -131,6 +132,18 @@ mod tests {
             .map(|ms| usize::from(budget.take(1, 100, began + Duration::from_millis(ms))))
             .sum();
         assert!((595..=600).contains(&sent), "the other client's goes on: {sent}");
+    }
+
+    /// Two clients that look at the clock in one order and have their turns in the other are given no second twice.
+    #[test]
+    fn a_time_that_is_past_brings_nothing() {
+        let mut budget = Budget::default();
+        let began = Instant::now();
+        while budget.take(1, 100, began) {}
+        let later = began + Duration::from_millis(100);
+        assert!(budget.take(10, 100, later));
+        assert_eq!(budget.set_periodic((ONE, Channel::Can1, 0), 1.0, 100, began), Ok(None));
+        assert!(!budget.take(1, 100, later));
     }
 
     /// While an entry had its share, nothing was saved up for afterwards.

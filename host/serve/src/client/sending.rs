@@ -166,16 +166,16 @@ impl Client {
         entry: Option<Periodic>,
     ) -> Result<Reply, Refusal> {
         let tick_hz = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.tick_hz));
-        let (mut had, now) = (None, Instant::now());
+        let mut had = None;
         if let Some(entry) = &entry {
             // The first frame leaves at once, however long the period is.
             self.may_transmit_on(channel)?;
-            self.take_from_budget(1, now + ROOM_TIMEOUT)?;
+            self.take_from_budget(1, Instant::now() + ROOM_TIMEOUT)?;
             let rate = f64::from(tick_hz) / f64::from(entry.period_ticks.max(1));
             self.must_be_permitted(Role::Send, |permit, _| {
                 permit.send(entry.frame.id())?;
                 let Some(most) = permit.frames_per_second else { return Ok(()) };
-                let of = (self.holder(), channel, slot);
+                let (of, now) = ((self.holder(), channel, slot), Instant::now());
                 had =
                     lock(&self.budget).set_periodic(of, rate, most, now).map_err(|()| Denied::Rate(most))?;
                 Ok(())

@@ -156,8 +156,8 @@ impl Server {
         // It waits for a connection.
         let _ = TcpStream::connect(doors.address);
         let _ = thread.join();
-        // Pages are told within a tick or two that it ends; those that do not listen are not waited for.
-        for _ in 0..20 {
+        // Pages are told within a tick or two that it ends, on a busy computer later; those that do not listen are not waited for.
+        for _ in 0..120 {
             if doors.connections.are_gone() {
                 break;
             }

@@ -83,7 +83,12 @@ away_and_back() {
     cat capture.err
     return 1
   fi
-  if is_capturing; then survived && gap_is_told; else ended 1; fi && info
+  if is_capturing; then survived && gap_is_told; else had_not_begun; fi && info
+}
+had_not_begun() {
+  ended 1 && return
+  cat capture.err capture.json
+  return 1
 }
 has_outcome() { ! is_capturing || has_told "the device is back after"; }
 

@@ -38,6 +38,7 @@ pub mod trigger;
 mod unflagged;
 mod validate;
 mod xml;
+pub mod zip;
 
 use std::path::Path;
 

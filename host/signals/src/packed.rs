@@ -4,18 +4,15 @@ use std::borrow::Cow;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
-use rawzip::ZipArchive;
-
 use super::fault::DatabaseError;
 use super::file_kind::FileKind;
+use super::zip::{self, Archive, MemberError};
 
 /// No database is longer: more is damage or malice.
 const MOST_BYTES: u64 = 256 << 20;
 /// So many files of an archive are looked at.
 const MOST_FILES: usize = 100_000;
-/// Methods of packing that are read (PKWARE's APPNOTE 6.3.10, section 4.4.5).
-const STORED: u16 = 0;
-const DEFLATED: u16 = 8;
+const TOO_LONG: &str = "unpacked, it has more than 256 MiB";
 
 /// The bytes of the database at a path, and the path with the name in an archive; `traces.zip/inside/a.dbc` names one of several.
 pub(super) fn read(path: &Path) -> Result<(PathBuf, Vec<u8>), DatabaseError> {
@@ -66,7 +63,7 @@ pub(super) fn unpack<'a>(
             all(flate2::read::MultiGzDecoder::new(bytes)).map_err(|error| packed(&error.to_string()))?;
         return Ok((name.to_owned(), unpacked.into()));
     }
-    if bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(b"PK\x05\x06") {
+    if zip::is_archive(bytes) {
         return member(file, bytes, inside).map(|(name, bytes)| (format!("{file}/{name}"), bytes.into()));
     }
     match inside {
@@ -80,7 +77,7 @@ fn all(source: impl Read) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     source.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > MOST_BYTES {
-        return Err(io::Error::other("unpacked, it has more than 256 MiB"));
+        return Err(io::Error::other(TOO_LONG));
     }
     Ok(bytes)
 }
@@ -88,57 +85,37 @@ fn all(source: impl Read) -> io::Result<Vec<u8>> {
 /// The file of this name in an archive, or the only database there.
 fn member(file: &str, bytes: &[u8], wanted: Option<&str>) -> Result<(String, Vec<u8>), DatabaseError> {
     let failed = |what: String| DatabaseError::Packed { file: file.to_owned(), what };
-    let archive = ZipArchive::from_slice(bytes)
-        .map_err(|_| failed("its directory is missing; was it copied to its end?".to_owned()))?;
-    let mut entries = archive.entries();
+    let several = |names| {
+        let missing = wanted.map(str::to_owned);
+        DatabaseError::Several { file: file.to_owned(), missing, names }
+    };
+    let archive = Archive::new(bytes).map_err(|error| failed(error.to_string()))?;
     let (mut found, mut names) = (None, Vec::new());
-    while let Some(entry) =
-        entries.next_entry().map_err(|_| failed("its directory is not whole".to_owned()))?
-    {
-        let name = String::from_utf8_lossy(entry.file_path().as_ref()).replace('\\', "/");
+    for member in archive.members() {
+        let member = member.map_err(|error| failed(error.to_string()))?;
+        let name = member.name.as_str();
         let is_own = !name.starts_with("__MACOSX/")
             && !name.rsplit('/').next().is_some_and(|last| last.starts_with('.'));
-        let is_database = is_own && FileKind::of(&name, Path::new(&name)).is_ok_and(|kind| !kind.is_toml());
-        if wanted.map_or(is_database, |wanted| wanted == name) {
-            found = Some((
-                name.clone(),
-                entry.flags().is_encrypted(),
-                entry.compression_method(),
-                entry.wayfinder(),
-            ));
-        }
+        let is_database = is_own && FileKind::of(name, Path::new(name)).is_ok_and(|kind| !kind.is_toml());
         if is_database && names.len() < MOST_FILES {
-            names.push(name);
+            names.push(name.to_owned());
+        }
+        if wanted.map_or(is_database, |wanted| wanted == name) {
+            found = Some(member);
         }
     }
-    match (&found, wanted) {
-        (None, Some(wanted)) => {
-            return Err(DatabaseError::Several {
-                file: file.to_owned(),
-                missing: Some(wanted.to_owned()),
-                names,
-            });
+    let member = match found {
+        Some(member) if wanted.is_some() || names.len() == 1 => member,
+        None if wanted.is_none() => {
+            return Err(failed("it has no .dbc, .kcd, .sym or .arxml file".to_owned()));
         }
-        (None, None) => return Err(failed("it has no .dbc, .kcd, .sym or .arxml file".to_owned())),
-        (Some(_), None) if names.len() > 1 => {
-            return Err(DatabaseError::Several { file: file.to_owned(), missing: None, names });
-        }
-        _ => {}
-    }
-    let Some((name, is_encrypted, method, place)) = found else {
-        return Err(failed("it is empty".to_owned()));
+        _ => return Err(several(names)),
     };
-    if is_encrypted {
-        return Err(failed(format!("{name} is encrypted; unpack it first")));
+    match archive.unpack(&member, MOST_BYTES) {
+        Ok(bytes) => Ok((member.name, bytes)),
+        Err(MemberError::TooLong) => Err(failed(format!("{} is damaged: {TOO_LONG}", member.name))),
+        Err(error) => Err(failed(format!("{} {error}", member.name))),
     }
-    let place = archive.get_entry(place).map_err(|_| failed(format!("{name} is not whole")))?;
-    let source: Box<dyn Read> = match method.as_u16() {
-        STORED => Box::new(place.data()),
-        DEFLATED => Box::new(flate2::read::DeflateDecoder::new(place.data())),
-        method => return Err(failed(format!("{name} is packed by method {method}; unpack it first"))),
-    };
-    let unpacked = all(place.verifying_reader(source));
-    Ok((name.clone(), unpacked.map_err(|error| failed(format!("{name} is damaged: {error}")))?))
 }
 
 #[cfg(test)]

@@ -1,10 +1,9 @@
 //! The documents of a file: a single ODX document, or those of a PDX package, a ZIP archive.
 
 use std::borrow::Cow;
-use std::io::Read as _;
 
+use cantap_signals::zip::{self, Archive, MemberError};
 use encoding_rs::{Encoding, UTF_8};
-use rawzip::ZipArchive;
 
 use super::error::OdxError;
 
@@ -12,14 +11,6 @@ use super::error::OdxError;
 pub const MOST_BYTES: u64 = 256 << 20;
 /// So many files of a package are looked at.
 const MOST_FILES: usize = 10_000;
-/// Methods of packing that are read (PKWARE's APPNOTE 6.3.10, section 4.4.5).
-const STORED: u16 = 0;
-const DEFLATED: u16 = 8;
-
-/// Whether bytes begin as a ZIP archive does.
-fn is_package(bytes: &[u8]) -> bool {
-    bytes.starts_with(b"PK\x03\x04") || bytes.starts_with(b"PK\x05\x06")
-}
 
 /// Whether a name is that of an ODX document: `car.odx`, `car.odx-d`, `CAR.ODX-CS`.
 pub fn is_document(name: &str) -> bool {
@@ -37,44 +28,35 @@ pub fn each(
     most_bytes: u64,
     mut read: impl FnMut(&str, &[u8]) -> Result<(), OdxError>,
 ) -> Result<(), OdxError> {
-    if !is_package(bytes) {
+    if !zip::is_archive(bytes) {
         return if bytes.len() as u64 > most_bytes { Err(OdxError::TooLarge) } else { read(file, bytes) };
     }
-    let damaged = |what: &str| OdxError::Package(what.to_owned());
-    let archive = ZipArchive::from_slice(bytes)
-        .map_err(|_| damaged("its directory is missing; was it copied to its end?"))?;
-    let mut entries = archive.entries();
-    let (mut left, mut files, mut documents) = (most_bytes, 0, 0);
-    while let Some(entry) = entries.next_entry().map_err(|_| damaged("its directory is not whole"))? {
-        files += 1;
-        if files > MOST_FILES {
-            return Err(damaged("it has more than 10,000 files"));
+    let archive = Archive::new(bytes).map_err(|error| OdxError::Package(error.to_string()))?;
+    let (mut left, mut documents) = (most_bytes, 0);
+    for (number, member) in archive.members().enumerate() {
+        let member = member.map_err(|error| OdxError::Package(error.to_string()))?;
+        if number >= MOST_FILES {
+            return Err(OdxError::Package("it has more than 10,000 files".to_owned()));
         }
-        let name = String::from_utf8_lossy(entry.file_path().as_ref()).replace('\\', "/");
-        let name = cantap_trace::clean::line(&name);
+        let name = cantap_trace::clean::line(&member.name);
         if !is_document(&name) {
             continue;
         }
-        let failed = |what: &str| OdxError::Package(format!("{name} {what}"));
-        if entry.flags().is_encrypted() {
-            return Err(failed("is encrypted; unpack it first"));
-        }
-        let place = archive.get_entry(entry.wayfinder()).map_err(|_| failed("is not whole"))?;
-        let packed = place.data();
-        let source: Box<dyn std::io::Read> = match entry.compression_method().as_u16() {
-            STORED => Box::new(packed),
-            DEFLATED => Box::new(flate2::read::DeflateDecoder::new(packed)),
-            method => return Err(failed(&format!("is packed by method {method}; unpack it first"))),
-        };
-        let mut unpacked = Vec::new();
-        let ended = place.verifying_reader(source).take(left + 1).read_to_end(&mut unpacked);
-        left = left.checked_sub(unpacked.len() as u64).ok_or(OdxError::TooLarge)?;
-        ended.map_err(|_| failed("is damaged: its check does not fit"))?;
+        let unpacked = archive.unpack(&member, left).map_err(|error| match error {
+            MemberError::TooLong => OdxError::TooLarge,
+            MemberError::Damaged(_) => {
+                OdxError::Package(format!("{name} is damaged: its check does not fit"))
+            }
+            error => OdxError::Package(format!("{name} {error}")),
+        })?;
+        left -= unpacked.len() as u64;
         read(&name, &unpacked)?;
         documents += 1;
     }
     if documents == 0 {
-        return Err(damaged("it has no .odx document; give the PDX or ODX file of the ECU"));
+        return Err(OdxError::Package(
+            "it has no .odx document; give the PDX or ODX file of the ECU".to_owned(),
+        ));
     }
     Ok(())
 }

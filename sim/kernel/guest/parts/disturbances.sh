@@ -71,13 +71,16 @@ attach
 check "the device works after its own restart" info
 
 # away_and_back COMMAND...: takes the device away at some point of a client's life, and gives it back. A client that had not begun yet ends
-# with 1; another has everything up to some point and from another on, and says that there was a gap.
+# with 1; another has everything up to some point and from another on, and says that there was a gap. One that a busy computer had not let
+# open the port yet would know of nothing.
 away_and_back() {
   board mark
   start -t 600
+  wait_until holds_port
   after_a_while 12
   if ! { "$@" && wait_until has_no_port && attach && wait_until has_outcome; }; then
     # It would keep the port from all that follow.
+    echo "no outcome: $(grep State "/proc/$CAPTURE/status"), waits in: $(cat "/proc/$CAPTURE"/task/*/wchan)"
     kill -9 "$CAPTURE"
     wait "$CAPTURE" 2> /dev/null
     cat capture.err
@@ -85,6 +88,7 @@ away_and_back() {
   fi
   if is_capturing; then survived && gap_is_told; else had_not_begun; fi && info
 }
+holds_port() { ! is_capturing || ls -l "/proc/$CAPTURE/fd" 2> /dev/null | grep -q ttyACM; }
 had_not_begun() {
   ended 1 && return
   cat capture.err capture.json

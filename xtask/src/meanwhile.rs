@@ -1,6 +1,6 @@
-//! The steps that only compile, at the lowest priority, while other steps wait for devices, kernels and browsers.
+//! Steps that run while other steps wait for devices, kernels and browsers.
 //!
-//! Both lanes use one target folder, so cargo's own lock makes one of them wait while the other compiles.
+//! All use one target folder, so cargo's own lock makes one of them wait while another compiles.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -11,21 +11,32 @@ use anyhow::{Context, Result};
 use crate::steps::Step;
 use crate::{toolchain, workspace};
 
-/// Steps under way; they end with this value.
+/// Steps that run one after the other, beside those of `cargo xtask ci` that are in no lane.
+pub struct Lane {
+    pub name: &'static str,
+    /// It begins when this step is over; with none, at once.
+    pub after: Option<Step>,
+    /// Whether it takes only the time that nothing else wants.
+    pub yields: bool,
+    pub steps: &'static [Step],
+}
+
+/// A lane under way; it ends with this value.
 pub struct Meanwhile {
+    pub name: &'static str,
     child: Child,
     output: PathBuf,
     ended: bool,
 }
 
 impl Meanwhile {
-    /// Begins them, one after the other, in this program once more.
-    pub fn begin(steps: &[Step]) -> Result<Self> {
+    /// Begins it, in this program once more.
+    pub fn begin(lane: &Lane) -> Result<Self> {
         let folder = workspace::target().join("xtask");
         std::fs::create_dir_all(&folder)?;
-        let output = folder.join("meanwhile.txt");
+        let output = folder.join(format!("{}.txt", lane.name));
         let file = File::create(&output).with_context(|| output.display().to_string())?;
-        let mut command = if toolchain::is_installed("nice") {
+        let mut command = if lane.yields && toolchain::is_installed("nice") {
             let mut nice = Command::new("nice");
             nice.args(["-n", "19", "cargo"]);
             nice
@@ -33,12 +44,12 @@ impl Meanwhile {
             Command::new("cargo")
         };
         command.args(["xtask", "ci"]).current_dir(workspace::root());
-        for step in steps {
+        for step in lane.steps {
             command.args(["--only", &step.name()]);
         }
         let child =
             command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn().context("cargo")?;
-        Ok(Self { child, output, ended: false })
+        Ok(Self { name: lane.name, child, output, ended: false })
     }
 
     /// Whether a step has failed already.

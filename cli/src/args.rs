@@ -20,6 +20,14 @@ pub fn milliseconds(text: &str) -> Result<f64, String> {
     })
 }
 
+/// A node or an address: in decimal digits, or after `0x` in hexadecimal ones.
+pub fn byte(text: &str) -> Option<u8> {
+    match text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")) {
+        Some(digits) => u8::from_str_radix(digits, 16).ok().filter(|_| !digits.starts_with('+')),
+        None => text.parse().ok().filter(|_| !text.starts_with('+')),
+    }
+}
+
 /// In nanoseconds, bounded so that deadlines can be added to it.
 pub fn nanoseconds(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).min(u64::MAX / 4)
@@ -71,6 +79,14 @@ mod tests {
         }
         for text in ["", "-1", "fast", "inf", "2h"] {
             assert!(milliseconds(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_node_is_written_in_either_base() {
+        assert_eq!(["5", "0x05", "0x7F", "0XfE", "253"].map(byte).map(Option::unwrap), [5, 5, 127, 254, 253]);
+        for text in ["", "0x", "+5", "0x+5", "256", "0x100", "7F", "-1"] {
+            assert_eq!(byte(text), None, "{text}");
         }
     }
 

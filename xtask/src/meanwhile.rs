@@ -8,18 +8,8 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 
 use anyhow::{Context, Result};
 
-use crate::steps::Step;
+use crate::steps::Lane;
 use crate::{toolchain, workspace};
-
-/// Steps that run one after the other, beside those of `cargo xtask ci` that are in no lane.
-pub struct Lane {
-    pub name: &'static str,
-    /// It begins when this step is over; with none, at once.
-    pub after: Option<Step>,
-    /// Whether it takes only the time that nothing else wants.
-    pub yields: bool,
-    pub steps: &'static [Step],
-}
 
 /// A lane under way; it ends with this value.
 pub struct Meanwhile {

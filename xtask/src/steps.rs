@@ -6,7 +6,6 @@ use xshell::cmd;
 
 use crate::board::Board;
 use crate::machine::Machine;
-use crate::meanwhile::Lane;
 use crate::outcome::Outcome;
 use crate::toolchain::Toolchain;
 #[cfg(unix)]
@@ -67,6 +66,16 @@ pub enum Step {
     Package,
     /// The command for Windows, run under Wine.
     Windows,
+}
+
+/// Steps that run one after the other, beside those of `cargo xtask ci` that are in no lane.
+pub struct Lane {
+    pub name: &'static str,
+    /// It begins when this step is over; with none, at once.
+    pub after: Option<Step>,
+    /// Whether it takes only the time that nothing else wants.
+    pub yields: bool,
+    pub steps: &'static [Step],
 }
 
 impl Step {

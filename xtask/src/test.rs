@@ -8,10 +8,10 @@ use clap::ValueEnum;
 
 use crate::board::Board;
 use crate::machine::Machine;
-use crate::meanwhile::{Lane, Meanwhile};
+use crate::meanwhile::Meanwhile;
 use crate::outcome::Outcome;
 use crate::processor_time;
-use crate::steps::Step;
+use crate::steps::{Lane, Step};
 
 /// The arguments of `cargo xtask test` and `cargo xtask ci`.
 #[derive(clap::Args)]

@@ -5,6 +5,8 @@ use std::process::ExitCode;
 
 use cantap::{FdBits, FdFrame, Frame, FrameBits, TraceFrame};
 
+use cantap_trace::grammar;
+
 use crate::args;
 use crate::completion;
 
@@ -17,6 +19,7 @@ use crate::completion;
 pub struct Args {
     /// The frame, as 123#DEADBEEF, 1F334455#, or 123#R4; a CAN FD one as 123##1DEADBEEF (1: switched bit rate, 2: error
     /// passive sender, 3: both, 0: neither).
+    #[arg(value_parser = frame)]
     frame: TraceFrame,
     /// Bit rate for the duration, in bit/s: 500000, 500k, 1M.
     #[arg(short, long, value_name = "RATE", default_value = "1M", value_parser = args::bitrate, add = completion::bit_rates())]
@@ -27,6 +30,10 @@ pub struct Args {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+}
+
+fn frame(text: &str) -> Result<TraceFrame, String> {
+    grammar::any_frame(text, false)
 }
 
 /// Runs it.

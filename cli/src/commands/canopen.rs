@@ -81,7 +81,7 @@ enum What {
     /// Send a node's heartbeat periodically, timed by the device's clock.
     Heartbeat {
         /// The number of the node to imitate, 1 to 127.
-        #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+        #[arg(value_parser = node)]
         node: u8,
         /// The state to report.
         #[arg(long, value_enum, default_value = "operational")]
@@ -126,11 +126,12 @@ enum State {
 }
 
 fn node_or_all(text: &str) -> Result<u8, String> {
-    match (text, text.parse()) {
-        ("all", _) => Ok(0),
-        (_, Ok(node @ 1..=127)) => Ok(node),
-        _ => Err("nodes are 1 to 127, or all".to_owned()),
-    }
+    if text == "all" { Ok(0) } else { node(text).map_err(|error| error + ", or all") }
+}
+
+fn node(text: &str) -> Result<u8, String> {
+    let node = args::byte(text).filter(|node| (1..=127).contains(node));
+    node.ok_or_else(|| "nodes are 1 to 127 (0x01 to 0x7F)".to_owned())
 }
 
 /// How long to listen for the new state after requesting it.

@@ -118,10 +118,10 @@ fn pgn(text: &str) -> Result<u32, String> {
 }
 
 fn address(text: &str) -> Result<u8, String> {
-    match (text, text.parse()) {
+    match (text, args::byte(text)) {
         ("all", _) => Ok(GLOBAL),
-        (_, Ok(address @ 0..=253)) => Ok(address),
-        _ => Err("addresses are 0 to 253, or all".to_owned()),
+        (_, Some(address @ 0..=253)) => Ok(address),
+        _ => Err("addresses are 0 to 253 (0x00 to 0xFD), or all".to_owned()),
     }
 }
 

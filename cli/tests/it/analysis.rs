@@ -147,7 +147,7 @@ fn pictures_are_written_in_the_format_of_their_suffix() {
         assert!(std::fs::read(&path).unwrap().starts_with(start), "{suffix}");
     }
     let (_, reason) = run(cantap().arg("plot").arg(boat()).args(["--bus-load", "-o", "load.gif"]), 2);
-    assert!(reason.contains("let it end in .svg, .png or .html"), "{reason}");
+    assert!(reason.contains("use .svg, .png or .html"), "{reason}");
     let (_, reason) = run(cantap().arg("plot").arg(boat()), 2);
     assert!(reason.contains("--db FILE"), "{reason}");
     let reason = failure(cantap().arg("plot").arg(boat()).args(["--timing", "7FF"]));

@@ -130,7 +130,7 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
             "monitor -d virtual -b 500k --once -o x.foo".to_owned(),
             "the name 'x.foo' does not show the format",
         ),
-        (format!("plot {TRACE} --bus-load -o x.foo"), "'x.foo' names no picture format; let it end in .svg"),
+        (format!("plot {TRACE} --bus-load -o x.foo"), "'x.foo' names no picture format; use .svg"),
         (format!("decode {TRACE}"), "no database to decode by; give one with --db FILE"),
         (format!("plot {TRACE}"), "no database to find signals in; give one with --db FILE"),
         (format!("search {TRACE}"), "nothing to look for; give --id, --data or a condition"),

@@ -26,7 +26,7 @@ pub(super) struct Times {
 #[derive(clap::Args)]
 struct Place {
     /// The node, 1 to 127.
-    #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+    #[arg(value_parser = super::node)]
     node: u8,
     /// The object's index in hexadecimal, as 1018.
     #[arg(value_parser = index)]

@@ -5,7 +5,7 @@
 #[non_exhaustive]
 pub enum PlotError {
     /// The name does not indicate the format.
-    #[error("'{0}' names no picture format; let it end in .svg, .png or .html")]
+    #[error("'{0}' names no picture format; use .svg, .png or .html")]
     UnknownFormat(String),
     /// The picture is too large, or too small, for PNG.
     #[error("a picture of {width} × {height} pixels cannot be drawn; choose another size")]

@@ -264,7 +264,7 @@ fn colour_is_used_only_where_asked_for() {
 fn the_suffix_chooses_the_format() {
     assert_eq!(PictureFormat::of_path(Path::new("a/b.PNG")).unwrap(), PictureFormat::Png);
     let message = PictureFormat::of_path(Path::new("b.gif")).unwrap_err().to_string();
-    assert_eq!(message, "'b.gif' names no picture format; let it end in .svg, .png or .html");
+    assert_eq!(message, "'b.gif' names no picture format; use .svg, .png or .html");
 }
 
 /// Writes the pictures to a folder for inspection: `CANTAP_PICTURES=DIR cargo test -p cantap-analysis

@@ -102,6 +102,12 @@ impl Binder<'_> {
         if compares {
             self.refuse_decimal_id(left_node, right_node)?;
             self.refuse_decimal_id(right_node, left_node)?;
+            refuse_range(left_node, right_node)?;
+            refuse_range(right_node, left_node)?;
+        }
+        if matches!(operator, Operator::Equal | Operator::NotEqual) {
+            refuse_impossible(&left, (right_node.at, &right))?;
+            refuse_impossible(&right, (left_node.at, &left))?;
         }
         Ok(match (left, right) {
             (Expression::Field(name), right) if compares => {
@@ -234,4 +240,27 @@ impl Binder<'_> {
         }
         Ok(None)
     }
+}
+
+/// Filters take `100-1FF` as a range. Here it is a difference, which no identifier would equal.
+fn refuse_range(id: &Node, other: &Node) -> Result<(), Fault> {
+    if let (Kind::Name(name), Kind::Binary(Operator::Subtract, first, last)) = (&id.kind, &other.kind)
+        && matches!(part(name), Some(Part::Id))
+        && let (Kind::Number(first), Kind::Number(last)) = (&first.kind, &last.kind)
+    {
+        return Err((other.at, ConditionFault::IdRange(*first as u64, *last as u64)));
+    }
+    Ok(())
+}
+
+/// A part of a frame that is compared with a number which it never has.
+fn refuse_impossible(compared: &Expression, (at, other): (usize, &Expression)) -> Result<(), Fault> {
+    let (Expression::Part(part), Some(value)) = (compared, constant(other)) else { return Ok(()) };
+    let Some((what, possible)) = part.values() else { return Ok(()) };
+    if value.fract() == 0.0 && (f64::from(*possible.start())..=f64::from(*possible.end())).contains(&value) {
+        return Ok(());
+    }
+    let number = |number: u32| if *part == Part::Id { format!("0x{number:X}") } else { number.to_string() };
+    let (first, last) = (number(*possible.start()), number(*possible.end()));
+    Err((at, ConditionFault::NeverEqual { what, first, last }))
 }

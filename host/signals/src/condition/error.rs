@@ -41,6 +41,19 @@ pub enum ConditionFault {
         "identifiers are hexadecimal: write 0x{0} for the one that is shown as {0}, or 0x{1:X} for the one that is {0} in decimal digits"
     )]
     DecimalId(String, u64),
+    /// An identifier compared with what filters take as a range.
+    #[error("a range of identifiers is written id >= 0x{0:X} and id <= 0x{1:X}")]
+    IdRange(u64, u64),
+    /// A part of a frame compared with a number that it never has.
+    #[error("{what} is from {first} to {last}")]
+    NeverEqual {
+        /// The part, with its article.
+        what: &'static str,
+        /// The lowest number that it can have.
+        first: String,
+        /// The highest one.
+        last: String,
+    },
     /// `a < b < c`.
     #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
     Chained,

@@ -255,6 +255,26 @@ mod tests {
         }
     }
 
+    /// A trigger waited for ever for a difference of two identifiers.
+    #[test]
+    fn what_can_never_be_is_refused() {
+        for (text, says) in [
+            ("id == 0x100-0x1FF", "a range of identifiers is written id >= 0x100 and id <= 0x1FF"),
+            ("0x100-0x1FF != id", "id >= 0x100 and id <= 0x1FF"),
+            ("id == 0x20000000", "an identifier is from 0x0 to 0x1FFFFFFF"),
+            ("id == -5", "an identifier is from"),
+            ("dlc == 99", "a DLC is from 0 to 15"),
+            ("len == 2.5", "a frame's length is from 0 to 64"),
+            ("ch == 256", "a channel's number is from 0 to 255"),
+        ] {
+            let error = Condition::new(text, &decoder()).map(drop).unwrap_err().to_string();
+            assert!(error.contains(says), "{text}: {error}");
+        }
+        for text in ["id - 0x100 == 5", "id == 0x700 + byte[0]", "dlc > 99", "ch == 1 + 1"] {
+            assert!(Condition::new(text, &decoder()).is_ok(), "{text}");
+        }
+    }
+
     /// The frames at which the condition holds.
     fn hits(condition: &str, frames: &[&str]) -> Vec<usize> {
         let mut condition = Condition::new(condition, &decoder()).unwrap();

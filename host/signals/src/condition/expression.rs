@@ -1,5 +1,7 @@
 //! A condition with its names bound, and its arithmetic.
 
+use std::ops::RangeInclusive;
+
 use crate::MessageRef;
 use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::grammar;
@@ -39,7 +41,7 @@ pub(super) enum Expression {
     Binary(Operator, Box<Expression>, Box<Expression>),
 }
 
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Part {
     Id,
     Channel,
@@ -50,6 +52,20 @@ pub(super) enum Part {
     Remote,
     Error,
     Lost,
+}
+
+impl Part {
+    /// What it is, and the values that it can have; `None` for what is only asked whether it is so.
+    pub(super) const fn values(self) -> Option<(&'static str, RangeInclusive<u32>)> {
+        Some(match self {
+            Self::Id => ("an identifier", 0..=0x1FFF_FFFF),
+            Self::Channel => ("a channel's number", 0..=u8::MAX as u32),
+            Self::Dlc => ("a DLC", 0..=15),
+            Self::Length => ("a frame's length", 0..=FD_MAX_BYTES as u32),
+            Self::Group => ("a PGN", 0..=0x3_FFFF),
+            Self::Extended | Self::Remote | Self::Error | Self::Lost => return None,
+        })
+    }
 }
 
 pub(super) fn part(name: &str) -> Option<Part> {

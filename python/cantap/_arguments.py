@@ -26,6 +26,7 @@ def words(words: str | Iterable[str], argument: str) -> list[str]:
 def identifiers(ids: str | SupportsIndex | Iterable[str | SupportsIndex], argument: str) -> list[str]:
     """One identifier or several, as patterns in hexadecimal digits or as numbers."""
     one: Any = ids
+    several: list[Any]
     try:
         several = [operator.index(one)]
     except TypeError:

@@ -141,12 +141,14 @@ impl Table {
             let (start, count) = (rows.start.unsigned_abs(), rows.slicelength);
             return Ok(Bound::new(py, table.slice(start, count))?.into_any());
         }
-        if key.hasattr("__index__")? {
-            return py.import("cantap._columns")?.call_method1("row", (slf, key));
-        }
-        let names: Vec<String> = key.extract().map_err(|_| {
-            PyTypeError::new_err("a table is asked for a column by its name, for columns by a list of names, for a row by its number, and for rows by a slice")
-        })?;
+        let Ok(names) = key.extract::<Vec<String>>() else {
+            if key.hasattr("__index__")? {
+                return py.import("cantap._columns")?.call_method1("row", (slf, key));
+            }
+            return Err(PyTypeError::new_err(
+                "a table is asked for a column by its name, for columns by a list of names, for a row by its number, and for rows by a slice",
+            ));
+        };
         Ok(Bound::new(py, table.select(&names)?)?.into_any())
     }
 

@@ -274,12 +274,12 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
         ),
         text(
             Format::Slcan,
-            "O\rt12320102001E\rT18FEF10000020\rr1233EA5F\r\x07e3ooo\re1a\rsp128000\rz\rB123900102030405060708090A0B0010\r",
+            "O\rt12320102001E\rT18FEF10000020\rr1233EA5F\r\x07e3ooo\re1a\rsp128000\rz\rb1239000102030405060708090A0B0010\r",
         ),
         text(
             Format::RosEcho,
             "header:\n  stamp:\n    sec: 7\n    nanosec: 5\n  frame_id: can\nid: 291\nis_rtr: true\nis_extended: false\nis_error: false\ndlc: 3\n\
-             data: [0, 0, 0, 0, 0, 0, 0, 0]\n---\nheader:\n  stamp:\n    sec: 7\n    nanosec: 6\n  frame_id: can\nid: 66\nis_extended: false\n\
+             data: [0, 0, 0, 0, 0, 0, 0, 0]\n---\nheader:\n  stamp:\n    sec: 7\n    nanosec: 6\n  frame_id: can\nid: 64\nis_extended: false\n\
              is_error: true\nlen: 8\ndata: [0, 8, 0, 0, 0, 0, 130, 0]\n---\ndata: hello\n---\n",
         ),
         text(

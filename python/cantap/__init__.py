@@ -4,7 +4,7 @@
 database, return decoded signals.
 """
 
-from ._columns import Column, Schema
+from ._columns import Column, Row, Schema
 from ._native import (
     CantapError,
     CantapWarning,
@@ -46,6 +46,7 @@ __all__ = [
     "Records",
     "Reply",
     "Report",
+    "Row",
     "Scan",
     "Schema",
     "Table",

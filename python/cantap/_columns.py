@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import html
+import operator
 import unicodedata
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 
 SHOWN_ROWS = 5
 """How many rows of a long table a notebook shows at its beginning, and as many at its end."""
+
+ROWS_AT_A_TIME = 4096
 
 
 class Column:
@@ -88,6 +91,70 @@ def _missing(kind: str) -> Any:
     import numpy as np
 
     return {"M": np.datetime64("NaT"), "O": None}.get(kind, float("nan"))
+
+
+class Row(Mapping[str, Any]):
+    """A row of a table: `row["id"]` or `row.id`. Values are those of `Column.to_list`: times are integers of nanoseconds since 1970, and where
+    there is no value there is `None`.
+    """
+
+    __slots__ = ("_names", "_values")
+
+    def __init__(self, names: tuple[str, ...], values: tuple[Any, ...]) -> None:
+        self._names = names
+        self._values = values
+
+    def __getitem__(self, name: str) -> Any:
+        try:
+            return self._values[self._names.index(name)]
+        except ValueError:
+            raise KeyError(f"there is no column {name!r}; there are {', '.join(self._names)}") from None
+
+    def __getattr__(self, name: str) -> Any:
+        # While a copy is made there are no names yet.
+        if name.startswith("_") or name not in self._names:
+            raise AttributeError(f"there is no column {name!r}")
+        return self[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def __reduce__(self) -> tuple[type[Row], tuple[tuple[str, ...], tuple[Any, ...]]]:
+        return (Row, (self._names, self._values))
+
+    def __repr__(self) -> str:
+        return f"<cantap.Row {' '.join(_shown(name, value) for name, value in self.items() if value is not None)}>"
+
+
+def _shown(name: str, value: Any) -> str:
+    if isinstance(value, bytes):
+        return f"{name}={value.hex().upper()}"
+    # Identifiers as everywhere else.
+    return f"{name}={value:X}" if name == "id" and isinstance(value, int) else f"{name}={value!r}"
+
+
+def rows(table: Table) -> Iterator[Row]:
+    """The rows in order. Those of a batch are made at a time, so that a large table does not take its memory twice."""
+    for batch in table.batches():
+        for start in range(0, len(batch), ROWS_AT_A_TIME):
+            yield from _rows_of(batch[start : start + ROWS_AT_A_TIME])
+
+
+def row(table: Table, at: SupportsIndex) -> Row:
+    """A row by its number from 0, or from the end if it is negative."""
+    place = operator.index(at)
+    place += len(table) if place < 0 else 0
+    if not 0 <= place < len(table):
+        raise IndexError(f"there is no row {operator.index(at)}: the table has {len(table)}")
+    return next(_rows_of(table[place : place + 1]))
+
+
+def _rows_of(table: Table) -> Iterator[Row]:
+    names = table.column_names
+    return (Row(names, values) for values in zip(*(table._values(name) for name in names)))
 
 
 class Schema(Mapping[str, str]):

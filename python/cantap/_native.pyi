@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Any, TypedDict, final, overload, type_check_only
+from typing import Any, SupportsIndex, TypedDict, final, overload, type_check_only
 
 import numpy as np
 import pandas as pd
@@ -11,7 +11,7 @@ import polars as pl
 import pyarrow as pa
 from matplotlib.axes import Axes
 
-from ._columns import Column, Schema
+from ._columns import Column, Row, Schema
 from ._sources import TraceFile
 
 __all__ = [
@@ -209,6 +209,9 @@ class Table:
     def __getitem__(self, key: str, /) -> Column: ...
     @overload
     def __getitem__(self, key: slice | list[str], /) -> Table: ...
+    @overload
+    def __getitem__(self, key: SupportsIndex, /) -> Row: ...
+    def __iter__(self) -> Iterator[Row]: ...
     def plot(self, *signals: str, ax: Axes | None = None, **options: Any) -> Axes:
         """Plots signals over time with Matplotlib, as steps; all of them if none is named. `options` are those of `Axes.plot`."""
     def _repr_html_(self) -> str: ...

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias
 
-from ._native import CantapWarning, is_trace_name
+from ._native import CantapWarning, Table, is_trace_name
 
 TraceFile: TypeAlias = "str | os.PathLike[str] | tuple[str, Callable[[], Any]]"
 """A path, or the name of a file and a function that opens it."""
@@ -44,7 +44,7 @@ def _files(source: Any, may_be_several: bool) -> Iterator[TraceFile]:
     elif hasattr(source, "read"):
         name = getattr(source, "name", None)
         yield name if isinstance(name, str) else "the file object", lambda: _Borrowed(source)
-    elif may_be_several and isinstance(source, Iterable) and not isinstance(source, (bytes, bytearray, dict)):
+    elif may_be_several and isinstance(source, Iterable) and not isinstance(source, (bytes, bytearray, dict, Table)):
         for one in source:
             yield from _files(one, False)
     else:

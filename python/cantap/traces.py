@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import IO, TYPE_CHECKING, Any, SupportsIndex, TypeAlias
 
 from . import _native
-from ._arguments import channels, words
+from ._arguments import channels, identifiers, words
 from ._sources import files, is_file
 from ._native import CantapWarning, Database, Report, Scan, Table
 
@@ -33,6 +33,7 @@ Rates: TypeAlias = "SupportsIndex | Mapping[Any, SupportsIndex]"
 Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[Any, Path]"
 Time: TypeAlias = "float | str | datetime.timedelta | datetime.date | np.datetime64 | np.timedelta64 | np.floating[Any] | np.integer[Any]"
 Words: TypeAlias = "str | Iterable[str]"
+Identifiers: TypeAlias = "str | SupportsIndex | Iterable[str | SupportsIndex]"
 
 BATCH_ROWS = 65_536
 
@@ -211,7 +212,7 @@ def search(
     path: Source,
     condition: str | None = None,
     *,
-    id: Words = (),
+    id: Identifiers = (),
     data: Words = (),
     max_count: int | None = None,
     db: Databases | None = None,
@@ -225,11 +226,11 @@ def search(
 ) -> Table:
     """The records that meet every given criterion, with `place`, their index among those that were read, from 0.
 
-    `condition`: as for `cantap search`, such as `"Speed > 80 and Gear == Drive"`. `id`: `123`, `18FEF1??`, `100-1FF`; any of
-    several may match. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several may match.
+    `condition`: as for `cantap search`, such as `"Speed > 80 and Gear == Drive"`. `id`: `"123"`, `"18FEF1??"`, `"100-1FF"`, or a number,
+    `0x123`, which has 29 bits if it is above 0x7FF; any of several may match. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several may match.
     """
     options = _options(path, db, (), filter, channel, start, end, format, zone, strict)
-    return _native.search(options, condition, words(id, "id"), words(data, "data"), max_count)
+    return _native.search(options, condition, identifiers(id, "id"), words(data, "data"), max_count)
 
 
 def stats(

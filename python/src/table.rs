@@ -124,7 +124,7 @@ impl Table {
         slf.py().import("cantap._columns")?.call_method1("Schema", (slf, types))
     }
 
-    /// A column by its name; rows by a slice; several columns by a list of names.
+    /// A column by its name; a row by its number; rows by a slice; several columns by a list of names.
     fn __getitem__<'py>(slf: &Bound<'py, Self>, key: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
         let (py, table) = (slf.py(), slf.get());
         if let Ok(name) = key.extract::<String>() {
@@ -141,9 +141,14 @@ impl Table {
             let (start, count) = (rows.start.unsigned_abs(), rows.slicelength);
             return Ok(Bound::new(py, table.slice(start, count))?.into_any());
         }
-        let names: Vec<String> = key.extract().map_err(|_| {
-            PyTypeError::new_err("a table is asked for a column by its name, for columns by a list of names, and for rows by a slice")
-        })?;
+        let Ok(names) = key.extract::<Vec<String>>() else {
+            if key.hasattr("__index__")? {
+                return py.import("cantap._columns")?.call_method1("row", (slf, key));
+            }
+            return Err(PyTypeError::new_err(
+                "a table is asked for a column by its name, for columns by a list of names, for a row by its number, and for rows by a slice",
+            ));
+        };
         Ok(Bound::new(py, table.select(&names)?)?.into_any())
     }
 
@@ -193,6 +198,11 @@ impl Table {
 
     fn __len__(&self) -> usize {
         self.rows()
+    }
+
+    /// Its rows in order.
+    fn __iter__<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        slf.py().import("cantap._columns")?.call_method1("rows", (slf,))
     }
 
     fn __repr__(&self) -> String {

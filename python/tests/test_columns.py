@@ -1,5 +1,8 @@
 """Tables by column and by row, and in a notebook."""
 
+import copy
+import pickle
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -45,7 +48,7 @@ def test_rows_are_taken_by_a_slice_and_columns_by_a_list(table):
     with pytest.raises(ValueError, match="in order"):
         table[::2]
     with pytest.raises(TypeError, match="by its name"):
-        table[3]
+        table[1.5]
 
 
 def test_rows_across_batches_are_those_of_the_whole(tmp_path):
@@ -56,6 +59,22 @@ def test_rows_across_batches_are_those_of_the_whole(tmp_path):
     assert len(table.batches()) > 2
     for rows in (slice(65_530, 65_545), slice(1, 140_000), slice(131_071, 131_073), slice(149_999, None)):
         assert pa.table(table[rows]) == whole[rows]
+
+
+def test_a_table_gives_its_rows(table):
+    rows = list(table)
+    assert len(rows) == len(table) and [row["Speed"] for row in rows] == table["Speed"].to_list()
+    first = table[0]
+    assert first == rows[0] == table[-len(table)] and first.time == table["time"][0]
+    assert first["time"] == first.time and list(first) == list(table.column_names)
+    assert "Speed=" in repr(first) and repr(first).startswith("<cantap.Row time=")
+    assert pickle.loads(pickle.dumps(first)) == first and copy.copy(first) == first
+    with pytest.raises(IndexError, match="there is no row"):
+        table[len(table)]
+    with pytest.raises(AttributeError, match="there is no column 'speed'"):
+        first.speed
+    with pytest.raises(KeyError, match="there is no column 'speed'"):
+        first["speed"]
 
 
 def test_a_schema_says_the_columns_types_as_the_documentation_does(table):

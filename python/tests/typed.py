@@ -24,3 +24,6 @@ assert_type(speed[2:4], cantap.Column)
 assert_type(table[2:4], cantap.Table)
 assert_type(table[["time", "Speed"]], cantap.Table)
 assert_type(table.schema["time"], str)
+assert_type(table[0], cantap.Row)
+for row in cantap.search("drive.blf", id=[0x123, "18FEF1??"]):
+    assert_type(row, cantap.Row)

@@ -2,9 +2,12 @@
 
 use std::io::{self, Read};
 
-/// Whether text that begins so has no other line ends. One at the very end may be half of `\r\n`.
+/// Whether text that begins so has no other line ends, but for one that a shell put at its end. One at the very end may be half of `\r\n`.
+/// BEL is an slcan adapter's answer.
 pub(crate) fn ends_lines(head: &[u8]) -> bool {
-    let is_text = |byte: &u8| *byte >= b' ' || matches!(byte, b'\r' | b'\t');
+    const BEL: u8 = 7;
+    let head = head.strip_suffix(b"\n").unwrap_or(head);
+    let is_text = |byte: &u8| *byte >= b' ' || matches!(*byte, b'\r' | b'\t' | BEL);
     head.iter().all(is_text) && memchr::memchr_iter(b'\r', head).nth(1).is_some()
 }
 

@@ -164,7 +164,11 @@ impl Decoder {
             self.dialect = Some(CsvDialect::Analyser);
             self.no_head.clear();
         } else {
-            // A table without its header is most likely one in python-can's columns, cut out of a file.
+            // A table without its header is most likely one in SavvyCAN's columns, if they fit, or in python-can's, cut out of a file.
+            if self.gvret.headless(line) {
+                self.dialect = Some(CsvDialect::Gvret);
+                return self.gvret.line(line);
+            }
             let row = python_can::row(line, &mut self.error_frames);
             if row.is_ok() {
                 self.dialect = Some(CsvDialect::PythonCan);

@@ -55,6 +55,10 @@ pub enum Format {
     UsbCan,
     /// Frames that a sketch printed, each part behind its label.
     Labelled,
+    /// What came from the port of an slcan adapter.
+    Slcan,
+    /// What `rostopic echo` and `ros2 topic echo` print of a bus.
+    RosEcho,
     /// A table of any columns.
     Table,
     /// openpilot's log of a drive.

@@ -23,6 +23,17 @@ pub(crate) fn is_head(line: &[u8]) -> bool {
     line.get(..HEAD.len()).is_some_and(|start| start.eq_ignore_ascii_case(HEAD))
 }
 
+/// Whether a line is a row of such a file, from which somebody cut out what he needed.
+pub(crate) fn is_row(line: &[u8]) -> bool {
+    let mut cells = line.split(|byte| *byte == b',').map(<[u8]>::trim_ascii);
+    let mut next = || cells.next().unwrap_or_default();
+    let (time, id, extended) = (next(), next(), next());
+    let is_start = text::decimal(time).is_some()
+        && id.len() == 8
+        && (extended.eq_ignore_ascii_case(b"false") || extended.eq_ignore_ascii_case(b"true"));
+    is_start && RowDecoder { has_direction: direction(next()).is_ok() }.line(line).is_ok()
+}
+
 /// Nanoseconds per unit of time in the file.
 const NS_PER_US: i64 = 1000;
 
@@ -32,6 +43,13 @@ impl RowDecoder {
         self.has_direction =
             line.split(|byte| *byte == b',').nth(3).is_some_and(|name| name.eq_ignore_ascii_case(b"Dir"));
         is_head(line)
+    }
+
+    /// Takes a row of a file without its header; true if it is one.
+    pub(crate) fn headless(&mut self, line: &[u8]) -> bool {
+        let fourth = line.split(|byte| *byte == b',').nth(3).map(<[u8]>::trim_ascii);
+        self.has_direction = fourth.is_some_and(|way| direction(way).is_ok());
+        is_row(line)
     }
 
     /// A row.
@@ -155,6 +173,16 @@ mod tests {
         let (records, issues) = tests::read(CSV, old);
         assert_eq!(issues, Vec::<String>::new());
         assert_eq!(tests::write(Format::Candump, &records), "(166.064000) can0 21A#FE3612\n");
+        // What `grep` leaves of it.
+        for rows in [
+            "370458000,00000394,false,0,3,00,E0,98\r\n370478000,18DAF110,true,1,2,FE,36\r\n",
+            "370458000,00000394,false,Rx,0,3,00,E0,98,\n370478000,18DAF110,true,Rx,1,2,FE,36,00,00,00,00,00,00,\n",
+        ] {
+            assert_eq!(Format::of_content(rows.as_bytes()), Some(CSV));
+            let (log, issues) = tests::as_log(CSV, rows);
+            assert_eq!(log, "(370.458000) can0 394#00E098\n(370.478000) can1 18DAF110#FE36\n");
+            assert_eq!(issues, Vec::<String>::new());
+        }
     }
 
     #[test]

@@ -7,21 +7,22 @@ mod tests;
 
 use std::borrow::Cow;
 
-use super::calendar::NS_PER_DAY;
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::issue::Fault;
+use super::line_clock::{LineClock, without_time};
 use super::row_format::{Line, RowFormat};
 use super::table;
 use super::text;
 use super::zone::Zone;
 use cantap_trace::TraceRecord;
-use parts::{Parts, bytes_of, next_line, stamp, tokens};
+use parts::{Packet, Parts, bytes_of, next_line, tokens};
 
 const NO_FRAME: &str = "lines of text without a frame";
 const NO_TIMES: &str =
     "nothing shows when the frames were printed: they stand at the last time that was, or at 0";
 const NO_BYTES: &str = "identifiers without data bytes behind them";
 const NO_PLACE: &str = "errors that a driver printed as frames";
+const CHARACTERS: &str = "data bytes were read as characters, as arduino-CAN's example prints them";
 const MAY_BE_DECIMAL: &str =
     "identifiers without 0x were read as hexadecimal: nothing shows whether they are decimal";
 
@@ -34,10 +35,12 @@ pub(crate) struct Decoder {
     pending: Option<Pending>,
     /// The line `ID  DLC   DATA` was there: the three stand without labels.
     has_names: bool,
-    time_ns: i64,
-    has_time: bool,
+    clock: LineClock,
     /// The last line had all bytes that its length says, in two digits each.
     is_whole: bool,
+    /// Bytes are printed as numbers below a line of arduino-CAN's.
+    has_numbers: bool,
+    noted_characters: bool,
     has_frames: bool,
     has_text: bool,
     notes: Vec<&'static str>,
@@ -100,24 +103,12 @@ impl Decoder {
         let fd = (!remote && len > 8).then(FdFields::default);
         let fields = FrameFields { id, remote, direction: parts.direction, len: len.min(64) as u8, fd };
         let event = fields.event(&data)?;
-        if !self.has_time && !std::mem::replace(&mut self.noted_times, true) {
+        if !self.clock.has_time && !std::mem::replace(&mut self.noted_times, true) {
             self.notes.push(NO_TIMES);
         }
         self.extended = None;
         self.has_frames = true;
         Ok(Line::Record(TraceRecord { time_ns, channel: 1, event }))
-    }
-
-    /// Takes the time before a line, if there is one.
-    fn take_time(&mut self, time_ns: i64) {
-        const HALF_NS: i64 = NS_PER_DAY / 2;
-        // A clock without a date begins again at midnight.
-        let of_day = (0..NS_PER_DAY).contains(&time_ns);
-        let day_ns = if of_day { self.time_ns - self.time_ns.rem_euclid(NS_PER_DAY) } else { 0 };
-        let day_ns = if day_ns < 3650 * NS_PER_DAY { day_ns } else { 0 };
-        let is_next = of_day && self.has_time && time_ns + day_ns + HALF_NS < self.time_ns;
-        self.time_ns = time_ns + day_ns + if is_next { NS_PER_DAY } else { 0 };
-        self.has_time = true;
     }
 
     /// A line of a table without labels: identifier, length and bytes.
@@ -128,11 +119,14 @@ impl Decoder {
         let len = text::hex(len).filter(|number| *number <= 15 && len.len() == 1)? as usize;
         let bytes = bytes_of(words, self.radix.data);
         let parts = Parts { id: Some(Cow::Borrowed(id)), len: Some(len), ..Parts::default() };
-        Some(self.record(&parts, self.time_ns, &bytes))
+        Some(self.record(&parts, self.clock.time_ns, &bytes))
     }
 
     /// A line behind one that has only an identifier; `None` if it does not go on with the frame.
     fn next_of(&mut self, pending: &mut Pending, line: &[u8]) -> Option<Result<Line, Fault>> {
+        if let (true, Some(len)) = (pending.parts.is_packet, pending.parts.len) {
+            return Some(self.packet(pending, len, line));
+        }
         let (bytes, is_last) = next_line(line, pending.bytes.len(), self.radix.data)?;
         pending.bytes.extend(bytes);
         let is_last = match pending.parts.len {
@@ -143,6 +137,22 @@ impl Decoder {
             return Some(Ok(Line::Nothing));
         }
         Some(self.record(&pending.parts, pending.time_ns, &pending.bytes))
+    }
+
+    /// The line below one of arduino-CAN's.
+    fn packet(&mut self, pending: &Pending, len: usize, line: &[u8]) -> Result<Line, Fault> {
+        let bytes = match Packet::of(line, len, self.radix.data) {
+            Some(Packet::Numbers(bytes)) => bytes,
+            Some(Packet::Either(byte)) if self.has_numbers => vec![byte],
+            Some(Packet::Either(_) | Packet::Characters) => {
+                if !std::mem::replace(&mut self.noted_characters, true) {
+                    self.notes.push(CHARACTERS);
+                }
+                line.to_vec()
+            }
+            None => return Err(Fault::malformed(format!("{len} data bytes"), line)),
+        };
+        self.record(&pending.parts, pending.time_ns, &bytes)
     }
 
     /// What is said of a frame of which no more came: with a single byte on each line, the first line of something else ends it.
@@ -182,12 +192,12 @@ impl Decoder {
                 let bytes = bytes_of(words.iter().copied(), self.radix.data);
                 self.is_whole = parts.len == Some(bytes.len())
                     && words.last().is_some_and(|word| text::after_0x(word).unwrap_or(word).len() == 2);
-                self.record(&parts, self.time_ns, &bytes)
+                self.record(&parts, self.clock.time_ns, &bytes)
             }
-            None if parts.remote || parts.len == Some(0) => self.record(&parts, self.time_ns, &[]),
+            None if parts.remote || parts.len == Some(0) => self.record(&parts, self.clock.time_ns, &[]),
             None if is_number => {
                 let parts = parts.into_owned();
-                self.pending = Some(Pending { parts, time_ns: self.time_ns, bytes: Vec::new() });
+                self.pending = Some(Pending { parts, time_ns: self.clock.time_ns, bytes: Vec::new() });
                 Ok(Line::Nothing)
             }
             None => Ok(Line::LeftOut(NO_FRAME)),
@@ -199,9 +209,15 @@ impl RowFormat for Decoder {
     fn begin(&mut self, buffered: &[u8]) {
         let (mut ids, mut bytes) = (Vec::new(), Vec::new());
         let (mut has_names, mut waits) = (false, false);
+        let mut packet = None;
         for line in buffered.split(|byte| *byte == b'\n') {
-            let (_, rest) = stamp(line.trim_ascii());
+            let rest = without_time(line.trim_ascii());
+            if let Some(len) = packet.take() {
+                self.has_numbers |= matches!(Packet::of(rest, len, false), Some(Packet::Numbers(_)));
+                continue;
+            }
             let parts = Parts::of(rest);
+            packet = parts.len.filter(|len| parts.is_packet && !parts.remote && *len > 0);
             if let (Some(Cow::Borrowed(id)), false) = (&parts.id, parts.is_decimal) {
                 ids.push(*id);
             }
@@ -226,10 +242,7 @@ impl RowFormat for Decoder {
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         self.is_whole = false;
         let line = parts::without_colours(line);
-        let (time, rest) = stamp(&line);
-        if let Some(time_ns) = time.and_then(|time| time.ns(zone)) {
-            self.take_time(time_ns);
-        }
+        let rest = self.clock.take(&line, zone);
         if let Some(mut pending) = self.pending.take() {
             if let Some(next) = self.next_of(&mut pending, rest) {
                 if matches!(next, Ok(Line::Nothing)) {

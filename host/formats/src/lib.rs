@@ -48,6 +48,7 @@ mod kvaser;
 mod labelled;
 mod left_out;
 mod line;
+mod line_clock;
 mod lz4;
 mod memory_file;
 mod mf4;
@@ -69,6 +70,7 @@ mod rotation;
 mod row_format;
 mod seek;
 mod sja1000;
+mod slcan;
 mod socketcan_packet;
 mod spec;
 #[cfg(feature = "sqlite")]

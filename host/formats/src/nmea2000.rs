@@ -4,6 +4,8 @@
 //! * canboat's plain form, `2011-11-24-22:42:04.388,2,127250,36,255,8,ff,10,…`: time, priority, PGN, source, destination, length and bytes.
 //! * Actisense's N2K ASCII, `A000159.990 CCFF7 0FF63 3B9F0000000002FF`: time of day, source, destination and priority, PGN, bytes.
 //!
+//! Signal K's log of what came in has such lines, each behind a time and the name of its source: `1555009219000;ydgw;00:29:58.617 R …`.
+//!
 //! Some gateways put fast packets together before they print them. The frames that those were are not in the file, so they are counted and left out.
 
 use super::calendar::NS_PER_DAY;
@@ -18,6 +20,7 @@ use cantap_trace::{Direction, TraceRecord};
 const EXPECTED: &str = "a line of an NMEA 2000 gateway such as '00:29:58.617 R 0DFF180D A2 8C', \
                         '2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10' or 'A000159.990 CCFF7 0FF63 3B9F'";
 const PUT_TOGETHER: &str = "NMEA 2000 messages that their gateway put together from several frames";
+const OF_ANOTHER_SOURCE: &str = "lines of Signal K's log that are of no NMEA 2000 gateway";
 const OF_THE_GATEWAY: &str = "messages of the gateway itself";
 
 /// The parameter groups from 1F000 to 1FEFF that are one frame each, less 1F000: those of canboat's table (2026, Apache-2.0).
@@ -63,6 +66,24 @@ struct Message<'a> {
 /// Whether a line is in one of the forms.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     message(line.trim_ascii()).is_some()
+}
+
+/// Whether a text is a log of Signal K with such a line.
+pub(crate) fn is_log_of_signal_k(text: &[u8]) -> bool {
+    let mut lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+    lines.any(|line| of_signal_k(line).is_some_and(|(_, line)| is_line(line)))
+}
+
+/// The time before a line of Signal K's log, in nanoseconds, and what a source sent: `1555009219000;ydgw;…`.
+fn of_signal_k(line: &[u8]) -> Option<(i64, &[u8])> {
+    /// A time since 1970 in milliseconds has as many digits from 2001 to 2286.
+    const DIGITS: usize = 13;
+    const NS_PER_MS: i64 = 1_000_000;
+    let (time, rest) = line.split_at_checked(DIGITS)?;
+    let rest = rest.strip_prefix(b";")?;
+    let source = memchr::memchr(b';', rest)?;
+    let ms = i64::try_from(text::decimal(time)?).ok()?;
+    Some((ms * NS_PER_MS, rest[source + 1..].trim_ascii()))
 }
 
 fn message(line: &[u8]) -> Option<Message<'_>> {
@@ -179,6 +200,7 @@ impl Decoder {
 impl RowFormat for Decoder {
     fn begin(&mut self, buffered: &[u8]) {
         let lines = buffered.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+        let lines = lines.map(|line| of_signal_k(line).map_or(line, |(_, line)| line));
         self.puts_together = lines.filter_map(message).any(|message| message.len > 8);
     }
 
@@ -186,8 +208,20 @@ impl RowFormat for Decoder {
         if line.is_empty() || line.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
-        let message = message(line).ok_or_else(|| Fault::malformed(EXPECTED, line))?;
-        let time_ns = self.time_ns(message.time, zone)?;
+        let (logged_ns, line) = match of_signal_k(line) {
+            Some((logged_ns, line)) => (Some(logged_ns), line),
+            None => (None, line),
+        };
+        let message = match message(line) {
+            Some(message) => message,
+            None if logged_ns.is_some() => return Ok(Line::LeftOut(OF_ANOTHER_SOURCE)),
+            None => return Err(Fault::malformed(EXPECTED, line)),
+        };
+        // A gateway's clock is the better one if it has a date.
+        let time_ns = match (message.time, logged_ns) {
+            (Time::OfDay(_), Some(logged_ns)) => logged_ns,
+            (time, _) => self.time_ns(time, zone)?,
+        };
         self.puts_together |= message.len > 8;
         let Some(raw) = message.id else { return Ok(Line::LeftOut(OF_THE_GATEWAY)) };
         if message.len > 8 || (message.of_messages || self.puts_together) && !is_single(raw) {
@@ -239,6 +273,20 @@ mod tests {
             log,
             "(1322174524.388000) can0 09F11224#FF103BFF7FCEF5FC\n(1664365019.668000) can0 18EA1724#14F001\n\
              (1664365019.668000) can0 18EAFF24#14F001\n"
+        );
+    }
+
+    #[test]
+    fn a_log_of_signal_k_has_dates_and_lines_of_other_sources() {
+        let file = "1555009219000;gps;$GPGLL,4916.45,N,12311.12,W,225444,A\n\
+                    1555009219100;ydgw;17:33:39.050 R 0DFF180D A2 8C 50 C0 FF FF FF FF\n\
+                    1555009219200;A;2019-04-11-17:33:39.150,6,59904,36,255,3,14,f0,01\n1555009219300;ydgw;17:3\n";
+        assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Nmea2000));
+        let (log, issues) = as_log(file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            log,
+            "(1555009219.100000) can0 0DFF180D#A28C50C0FFFFFFFF\n(1555004019.150000) can0 18EAFF24#14F001\n"
         );
     }
 

@@ -12,7 +12,7 @@ use super::codec::Decode;
 use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place};
-use super::row_format::RowFormat as _;
+use super::row_format::{Line, RowFormat as _};
 use super::table::{self, Columns, TypedColumn, TypedForm};
 use super::zone::Zone;
 use cantap_trace::clean;
@@ -199,7 +199,9 @@ impl Table {
         }
         for (row, number) in rows.iter().zip(before + 1..) {
             found.extend(match self.decoder.typed_row(row, zone) {
-                Ok(record) => record.map(Found::Record),
+                Ok(Line::Record(record)) => Some(Found::Record(record)),
+                Ok(Line::LeftOut(what)) => Some(Found::LeftOut(what)),
+                Ok(_) => None,
                 Err(fault) => Some(Found::Issue(Place::Row(number), fault)),
             });
         }

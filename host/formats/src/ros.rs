@@ -1,5 +1,5 @@
-//! CAN frames in the recordings of robots: `can_msgs/Frame` and `ros2_socketcan_msgs/FdFrame`, in MCAP files, in the bags of ROS 1, and in
-//! those of ROS 2 that are SQLite databases.
+//! CAN frames in the recordings of robots: `can_msgs/Frame` and `ros2_socketcan_msgs/FdFrame`, in MCAP files, in the bags of ROS 1, in
+//! those of ROS 2 that are SQLite databases, and as text.
 //!
 //! Source: the messages' definitions in ros_canopen and ros2_socketcan, ROS 1's serialization, and OMG's CDR as ROS 2 uses it.
 
@@ -7,6 +7,7 @@ pub(crate) mod bag;
 pub(crate) mod container;
 #[cfg(feature = "sqlite")]
 pub(crate) mod database;
+pub(crate) mod echo;
 mod fields;
 pub(crate) mod mcap;
 mod nested;

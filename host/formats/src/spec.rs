@@ -12,14 +12,15 @@ use super::format::Format;
 use super::read_options::ReadOptions;
 use super::ros::bag::Bag;
 use super::ros::container::{self, Container};
+use super::ros::echo;
 use super::ros::mcap::Mcap;
 use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, table, trc,
-    usbcan,
+    crtd, csv, gvret, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, slcan, table,
+    trc, usbcan,
 };
 
 /// One format.
@@ -207,7 +208,7 @@ const FORMATS: &[FormatSpec] = &[
         format: Format::Csv(CsvDialect::Gvret),
         names: &["csv-gvret", "gvret"],
         suffixes: &[],
-        begins: |head| gvret::is_head(head.line),
+        begins: |head| gvret::is_head(head.line) || gvret::is_row(head.line),
         has_head: true,
         reader: |options| Box::new(csv::Decoder::new(&options.zone)),
         writer: Some(|_| Box::new(gvret::Encoder::default())),
@@ -353,7 +354,7 @@ const FORMATS: &[FormatSpec] = &[
         format: Format::Nmea2000,
         names: &["n2k"],
         suffixes: &["raw", "txt", "log"],
-        begins: |head| nmea2000::is_line(head.first),
+        begins: |head| nmea2000::is_line(head.first) || nmea2000::is_log_of_signal_k(head.text),
         has_head: false,
         reader: |_| Box::new(Rows::<nmea2000::Decoder>::default()),
         writer: None,
@@ -388,11 +389,29 @@ const FORMATS: &[FormatSpec] = &[
         writer: None,
     },
     FormatSpec {
+        format: Format::Slcan,
+        names: &["slcan"],
+        suffixes: &["slcan", "txt", "log"],
+        begins: |head| slcan::is_head(head.bytes),
+        has_head: false,
+        reader: |_| Box::new(Rows::<slcan::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::RosEcho,
+        names: &["ros-echo"],
+        suffixes: &["yaml", "txt", "log"],
+        begins: |head| echo::is_head(head.text),
+        has_head: false,
+        reader: |_| Box::new(Rows::<echo::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
         format: Format::Table,
         names: &["table"],
         suffixes: &["csv", "tsv", "txt"],
         begins: |head| {
-            (table::is_first(head.first) || table::has_names_below(head.text))
+            (table::is_first(head.first) || table::has_names_below(head.bytes))
                 && !is_of_another(head, &[Format::Table])
         },
         has_head: false,

@@ -1,5 +1,6 @@
 //! Tables of any columns: what they mean is said by the user, shown by the names above them, or by the first row.
 
+mod cells;
 mod columns;
 mod layout;
 mod time;
@@ -15,8 +16,9 @@ use super::panda::{self, REJECTED};
 use super::row_format::{Line, RowFormat};
 use super::text;
 use super::zone::Zone;
-use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::{Direction, TraceRecord};
+use cells::{byte, direction, id, is_empty, is_list, length, mark, push_bytes};
 use columns::{Form, Role};
 use layout::{Layout, Separator};
 use time::FileDate;
@@ -25,6 +27,8 @@ pub(crate) use time::date;
 const NO_TIMES: &str = "the table has no times: all its frames stand at 0";
 const OTHERS: &str = "columns of the table that have no place in a trace, such as labels, were left out";
 const ABOVE_NAMES: &str = "lines above the names of the table's columns";
+const NAMES_AGAIN: &str = "further lines of names of columns";
+const ERROR_FRAMES: &str = "rows marked as error frames, of which a table does not say enough";
 const MAY_BE_DECIMAL: &str =
     "identifiers were read as hexadecimal, but may be decimal: the columns say so with id=NAME:dec";
 
@@ -35,6 +39,8 @@ pub(crate) struct Decoder {
     layout: Option<Layout>,
     /// The first rows, to see how numbers are written in them.
     sample: Vec<u8>,
+    /// The name of the first column.
+    first_name: Vec<u8>,
     /// How many lines there are still above the names of the columns.
     above: usize,
     unit_ns: Option<i64>,
@@ -60,14 +66,17 @@ pub(crate) fn is_first(line: &[u8]) -> bool {
 pub(crate) fn has_names_below(head: &[u8]) -> bool {
     let is_names =
         |line: &[u8]| Layout::of_names(line).is_some_and(|layout| layout.place(Role::Time).is_some());
-    first_lines(head).any(is_names)
+    first_lines(head).take(LINES).any(is_names)
+        || memchr::memmem::find(head, b"\nLine,Abs Time(Sec),").is_some()
 }
 
-/// The first lines that are no comments, among which the names above the columns are looked for.
+/// How many lines may stand above the names in a table that is not known otherwise.
+const LINES: usize = 40;
+
+/// The lines that are no comments, among which the names above the columns are looked for.
 fn first_lines(head: &[u8]) -> impl Iterator<Item = &[u8]> {
-    const LINES: usize = 40;
     let lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
-    lines.filter(|line| !line.is_empty() && !line.starts_with(b"#")).take(LINES)
+    lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
 /// Columns as a user may give them for a table that is not known by itself.
@@ -98,7 +107,10 @@ impl Decoder {
 
     /// How many lines stand above the names of the columns, if there are names.
     fn lines_above_names(&self) -> usize {
-        let is_row = first_lines(&self.sample).map(|line| self.layout_of(line).map(|(_, is_row)| is_row));
+        /// Vehicle Spy says more of its networks than others of anything.
+        const LINES: usize = 400;
+        let is_row =
+            first_lines(&self.sample).take(LINES).map(|line| self.layout_of(line).map(|(_, is_row)| is_row));
         let first = is_row.enumerate().find_map(|(above, is_row)| Some((above, is_row.ok()?)));
         first.filter(|(_, is_row)| !is_row).map_or(0, |(above, _)| above)
     }
@@ -108,6 +120,9 @@ impl Decoder {
         let (layout, is_row) = self.layout_of(line)?;
         self.radix = self.radix_of(&layout, is_row)?;
         self.note_layout(&layout);
+        if !is_row {
+            self.first_name = layout.separator.cells(line).first().copied().unwrap_or_default().to_vec();
+        }
         self.layout = Some(layout);
         self.sample = Vec::new();
         Ok(is_row)
@@ -144,11 +159,11 @@ impl Decoder {
 
     /// The record of a row with a cell for each column; empty where there is nothing, or where none is wanted.
     #[cfg(feature = "parquet")]
-    pub(crate) fn typed_row(&mut self, cells: &[&[u8]], zone: &Zone) -> Result<Option<TraceRecord>, Fault> {
-        let Some(layout) = self.layout.take() else { return Ok(None) };
-        let record = self.record_of_cells(&layout, cells, zone);
+    pub(crate) fn typed_row(&mut self, cells: &[&[u8]], zone: &Zone) -> Result<Line, Fault> {
+        let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
+        let line = self.line_of_cells(&layout, cells, zone);
         self.layout = Some(layout);
-        record.map(Some)
+        line
     }
 
     /// What is worth knowing about the columns.
@@ -213,19 +228,39 @@ impl Decoder {
         let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
         let record = if is_rejected(&layout, line) {
             Ok(Line::LeftOut(REJECTED))
+        } else if self.names_again(&layout, line) {
+            Ok(Line::LeftOut(NAMES_AGAIN))
         } else {
-            self.record(&layout, line, zone).map(Line::Record)
+            self.line_of_row(&layout, line, zone)
         };
         self.layout = Some(layout);
         record
     }
 
-    fn record(&mut self, layout: &Layout, line: &[u8], zone: &Zone) -> Result<TraceRecord, Fault> {
+    /// Whether a line has names as the first one had: those of another bus, or of the next file of several that were joined.
+    fn names_again(&self, layout: &Layout, line: &[u8]) -> bool {
+        let is_name = self.first_name.iter().any(u8::is_ascii_alphabetic);
+        let cells = layout.separator.cells(line);
+        let has_numbers = cells.iter().any(|cell| text::decimal(cell).is_some());
+        is_name
+            && !has_numbers
+            && cells.first().is_some_and(|cell| cell.eq_ignore_ascii_case(&self.first_name))
+    }
+
+    fn line_of_row(&mut self, layout: &Layout, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let cells = layout.separator.cells(line);
         if cells.len() < layout.least_cells() {
             return Err(Fault::malformed(format!("{} cells or more", layout.least_cells()), line));
         }
-        self.record_of_cells(layout, &cells, zone)
+        self.line_of_cells(layout, &cells, zone)
+    }
+
+    fn line_of_cells(&mut self, layout: &Layout, cells: &[&[u8]], zone: &Zone) -> Result<Line, Fault> {
+        let error = layout.place(Role::Error).and_then(|place| cells.get(place.at));
+        if error.and_then(|cell| mark(cell)) == Some(true) {
+            return Ok(Line::LeftOut(ERROR_FRAMES));
+        }
+        self.record_of_cells(layout, cells, zone).map(Line::Record)
     }
 
     fn record_of_cells(
@@ -245,7 +280,17 @@ impl Decoder {
         let raw = id(shown, self.radix.id)?;
         let extended = cell(Role::Extended).and_then(|(cell, _)| mark(cell));
         let id = identifier(raw, extended.unwrap_or(raw > 0x7FF), shown)?;
-        let remote = cell(Role::Remote).and_then(|(cell, _)| mark(cell)).unwrap_or(false);
+        let remote = match cell(Role::Remote).map(|(cell, _)| (cell, mark(cell))) {
+            // Vehicle Spy's flags of CAN FD, whose bytes go on in other columns.
+            Some((flags, None)) if flags.contains(&b'-') => {
+                return Err(Fault::malformed(
+                    "T or F for a remote frame: CAN FD is not read from such a table",
+                    flags,
+                ));
+            }
+            Some((_, remote)) => remote.unwrap_or(false),
+            None => false,
+        };
         let direction = match cell(Role::Direction) {
             Some((way, _)) => direction(way)?,
             None => Direction::Rx,
@@ -357,91 +402,6 @@ pub(crate) fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
     different.dedup();
     // Those of one digit are the same in both.
     (different.len() >= ENOUGH, different.len() >= ENOUGH || different.iter().all(|id| id.len() == 1))
-}
-
-fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
-    let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
-    let number = text::number(digits, decimal);
-    let expected =
-        if decimal { "an identifier in decimal digits" } else { "an identifier in hexadecimal digits" };
-    number.ok_or_else(|| Fault::malformed(expected, shown))
-}
-
-/// A length; programs that know no whole numbers write it with a fraction.
-fn length(cell: &[u8]) -> Result<usize, Fault> {
-    let number = text::decimal(cell.strip_suffix(b".0").unwrap_or(cell));
-    let len = number.filter(|len| *len <= FD_MAX_BYTES as u64);
-    len.map(|len| len as usize).ok_or_else(|| Fault::malformed("a length of 0 to 64", cell))
-}
-
-/// Yes or no, as different programs write it; `None` for anything else.
-fn mark(cell: &[u8]) -> Option<bool> {
-    let is = |words: &[&str]| words.iter().any(|word| cell.eq_ignore_ascii_case(word.as_bytes()));
-    if is(&[
-        "1", "true", "yes", "y", "x", "e", "ext", "extended", "xtd", "29", "29-bit", "r", "rtr", "remote",
-    ]) {
-        Some(true)
-    } else if is(&["0", "false", "no", "n", "s", "std", "standard", "11", "11-bit", "d", "-", ""]) {
-        Some(false)
-    } else {
-        None
-    }
-}
-
-fn direction(way: &[u8]) -> Result<Direction, Fault> {
-    let is = |words: &[&str]| words.iter().any(|word| way.eq_ignore_ascii_case(word.as_bytes()));
-    if is(&["rx", "r", "receive", "received", "in", "0", ""]) {
-        Ok(Direction::Rx)
-    } else if is(&["tx", "t", "transmit", "transmitted", "sent", "out", "1"]) {
-        Ok(Direction::Tx)
-    } else {
-        Err(Fault::malformed("'Rx' or 'Tx'", way))
-    }
-}
-
-/// Whether a cell of a byte holds none.
-fn is_empty(cell: &[u8]) -> bool {
-    cell.is_empty() || cell.eq_ignore_ascii_case(b"nan") || cell == b"-"
-}
-
-/// One byte.
-fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
-    text::number(cell, decimal).and_then(|byte| u8::try_from(byte).ok())
-}
-
-/// Whether a cell is a list as Python prints one, `[78, 32, 137]`: its numbers are decimal.
-fn is_list(cell: &[u8]) -> bool {
-    let inner = cell.strip_prefix(b"[").and_then(|cell| cell.strip_suffix(b"]"));
-    let is_number =
-        |word: &[u8]| text::decimal(word).is_some() && (word.len() == 1 || !word.starts_with(b"0"));
-    inner.is_some_and(|inner| {
-        inner.contains(&b',') && inner.split(|byte| *byte == b',').all(|word| is_number(word.trim_ascii()))
-    })
-}
-
-/// The bytes of a cell: digits without gaps, or bytes with something between them.
-fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fault> {
-    let is_between =
-        |byte: &u8| matches!(byte, b' ' | b'-' | b':' | b',' | b';' | b'_' | b'.' | b'|' | b'[' | b']');
-    for word in cell.split(is_between).filter(|word| !word.is_empty()) {
-        let fault = || Fault::malformed("data bytes", cell);
-        // No bytes at all, as Cabana writes them.
-        if text::after_0x(word).is_some_and(<[u8]>::is_empty) {
-            continue;
-        }
-        if decimal || text::after_0x(word).unwrap_or(word).len() <= 2 {
-            bytes.push(byte(word, decimal).ok_or_else(fault)?);
-        } else {
-            let digits = text::after_0x(word).unwrap_or(word);
-            if !digits.len().is_multiple_of(2) {
-                return Err(fault());
-            }
-            for pair in digits.chunks_exact(2) {
-                bytes.push(text::hex_pair(pair[0], pair[1]).ok_or_else(fault)?);
-            }
-        }
-    }
-    Ok(())
 }
 
 impl RowFormat for Decoder {

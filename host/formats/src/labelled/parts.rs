@@ -2,9 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::super::table;
-use super::super::text::{self, NS_PER_S};
-use super::super::zone::Zone;
+use super::super::text;
 use cantap_trace::Direction;
 
 /// What a label stands before.
@@ -63,6 +61,8 @@ pub(super) struct Parts<'a> {
     pub len: Option<usize>,
     pub data: Option<&'a [u8]>,
     pub direction: Direction,
+    /// It is a line of arduino-CAN's example, whose bytes stand below: as characters, or as numbers if somebody changed it.
+    pub is_packet: bool,
 }
 
 /// The last word, and what is before it.
@@ -117,6 +117,17 @@ impl<'a> Parts<'a> {
             let id = tokens(id).next().unwrap_or_default();
             parts.is_decimal = text::after_0x(id).is_none();
             parts.id = text::number(id, parts.is_decimal).map(|_| Cow::Borrowed(id));
+        }
+        if parts.id.is_none()
+            && let Some(id) = after_words(line, b"packet with id ")
+        {
+            let id = tokens(id).next().unwrap_or_default();
+            parts.id = text::number(id, false).map(|_| Cow::Borrowed(id));
+            parts.is_packet = parts.id.is_some();
+            parts.extended = Some(contains(line, b"extended "));
+            parts.remote = contains(line, b"rtr packet");
+            let len = after_words(line, b"length ").and_then(|len| tokens(len).next());
+            parts.len = len.and_then(|len| text::number(len, true)).map(|len| len as usize);
         }
         parts.remote |= contains(line, b"remote request") || contains(line, b"(rtr)");
         parts
@@ -253,6 +264,30 @@ pub(super) fn next_line(line: &[u8], count: usize, is_decimal: bool) -> Option<(
     (bytes.len() == count || after.is_some() && !bytes.is_empty()).then_some((bytes, true))
 }
 
+/// How the line below one of arduino-CAN's has so many bytes.
+pub(super) enum Packet {
+    /// As numbers.
+    Numbers(Vec<u8>),
+    /// As characters, as the example prints them.
+    Characters,
+    /// Either: a single digit.
+    Either(u8),
+}
+
+impl Packet {
+    pub(super) fn of(line: &[u8], len: usize, is_decimal: bool) -> Option<Self> {
+        let words = tokens(line).count();
+        let numbers = bytes_of(tokens(line), is_decimal);
+        let are_numbers = numbers.len() == len && (words == len || words == 1 && line.len() == 2 * len);
+        match (are_numbers, line.len() == len) {
+            (true, true) => numbers.first().map(|byte| Self::Either(*byte)),
+            (true, false) => Some(Self::Numbers(numbers)),
+            (false, true) => Some(Self::Characters),
+            (false, false) => None,
+        }
+    }
+}
+
 /// A line without the terminal's colours.
 pub(super) fn without_colours(line: &[u8]) -> Cow<'_, [u8]> {
     if memchr::memchr(0x1B, line).is_none() {
@@ -267,62 +302,4 @@ pub(super) fn without_colours(line: &[u8]) -> Cow<'_, [u8]> {
     }
     clean.extend_from_slice(rest);
     Cow::Owned(clean.trim_ascii().to_vec())
-}
-
-/// A time as it stands before a line.
-pub(super) enum Stamp<'a> {
-    Date(&'a [u8]),
-    Ns(i64),
-}
-
-impl Stamp<'_> {
-    /// In nanoseconds; a clock without a date counts from midnight.
-    pub(super) fn ns(&self, zone: &Zone) -> Option<i64> {
-        match self {
-            Self::Date(date) => table::date(date, zone),
-            Self::Ns(ns) => Some(*ns),
-        }
-    }
-}
-
-/// The time before a line, and the rest of it: `12:34:56.789 -> …` (Arduino), `… > …` (PlatformIO), `[12:34:56.789] …`, with a date or without, and
-/// `I (1234) twai: …` (ESP-IDF, milliseconds since the start).
-pub(super) fn stamp(line: &[u8]) -> (Option<Stamp<'_>>, &[u8]) {
-    if let [b'E' | b'W' | b'I' | b'D' | b'V', b' ', b'(', rest @ ..] = line
-        && let Some(end) = memchr::memchr(b')', rest)
-    {
-        let (inside, after) = (&rest[..end], rest[end + 1..].trim_ascii());
-        let ms = text::decimal(inside).and_then(|ms| i64::try_from(ms).ok()?.checked_mul(NS_PER_S / 1000));
-        return (Some(ms.map_or(Stamp::Date(inside), Stamp::Ns)), after);
-    }
-    if let Some(rest) = line.strip_prefix(b"[")
-        && let Some(end) = memchr::memchr(b']', rest)
-    {
-        let inside = rest[..end].trim_ascii();
-        let after = rest[end + 1..].trim_ascii();
-        if is_date(inside) {
-            return (Some(Stamp::Date(inside)), after);
-        }
-        return match text::time(inside, NS_PER_S, b'.').filter(|_| inside.contains(&b'.')) {
-            Some(ns) => (Some(Stamp::Ns(ns)), after),
-            None => (None, line),
-        };
-    }
-    let (first, rest) = text::word(line);
-    let (_, after) = text::word(rest);
-    let both = &line[..line.len() - after.len()];
-    let both = both.trim_ascii_end();
-    let (date, rest) = match (is_date(both), is_date(first)) {
-        (true, _) => (both, after),
-        (false, true) => (first, rest),
-        (false, false) => return (None, line),
-    };
-    let rest = rest.trim_ascii();
-    let rest = rest.strip_prefix(b"->").or_else(|| rest.strip_prefix(b">")).unwrap_or(rest);
-    (Some(Stamp::Date(date)), rest.trim_ascii())
-}
-
-fn is_date(text: &[u8]) -> bool {
-    let has_clock = memchr::memchr_iter(b':', text).count() == 2;
-    has_clock && text[0].is_ascii_digit() && table::date(text, &Zone::default()).is_some()
 }

@@ -67,6 +67,18 @@ fn what_the_examples_of_arduino_teensy_and_esp_idf_print_is_read() {
             "(0.000000) can0 00000123#12FF\n(0.000000) can0 010#01\n",
         ),
         (
+            "arduino-CAN, whose bytes are characters",
+            "CAN Receiver\r\nReceived packet with id 0x12 and length 5\r\nhello\r\n\r\n\
+             Received extended packet with id 0x123 and length 1\r\n7\r\n\r\n\
+             Received RTR packet with id 0x12 and requested length 3\r\n\r\nReceived packet with id 0x13 and length 0\r\n\r\n",
+            "(0.000000) can0 012#68656C6C6F\n(0.000000) can0 00000123#37\n(0.000000) can0 012#R3\n(0.000000) can0 013#\n",
+        ),
+        (
+            "arduino-CAN, with its bytes as numbers",
+            "Received packet with id 0x12 and length 3\r\n1 A FF \r\n\r\nReceived packet with id 0x7FF and length 1\r\n7 \r\n",
+            "(0.000000) can0 012#010AFF\n(0.000000) can0 7FF#07\n",
+        ),
+        (
             "ESP-IDF's log, in colour",
             "\x1b[0;32mI (1500) twai: ID=0x123, DLC=2, DATA=[0A FF]\x1b[0m\n\x1b[0;32mI (1600) twai: TX ID=0x18DAF110 len=3 data=010203\x1b[0m\n",
             "(1.500000) can0 123#0AFF\n(1.600000) can0 18DAF110#010203 T\n",
@@ -106,6 +118,12 @@ fn damaged_frames_are_named_and_text_is_counted() {
     // An identifier at the end waits for its bytes.
     let (_, issues) = tests::as_log(Format::Labelled, "ID: 0x12 DLC: 2\n");
     assert!(issues[0].contains("the last frame's data bytes"), "{issues:?}");
+    // Bytes that are no characters end a line of arduino-CAN's, or are not told from what stands around it.
+    let (log, issues) = tests::as_log(
+        Format::Labelled,
+        "Received packet with id 0x12 and length 3\n\x01\n\x02\nReceived packet with id 0x12 and length 2\nab\n",
+    );
+    assert_eq!((log.as_str(), issues.len()), ("(0.000000) can0 012#6162\n", 1), "{issues:?}");
     for text in ["Serial ID: 5\nData: hello\n", "id: 1\n", "Chip ID: 0x12 size: 3\nready\n", "data: 00 11\n"]
     {
         assert_eq!(Format::of_content(text.as_bytes()), None, "{text}");

@@ -60,6 +60,13 @@ fn files_are_known_by_their_beginning() {
         (utf8("Index,Direction,Timesteamp,ID,Format,Type,Length,Data,\n"), Format::UsbCan),
         (utf8("MCP2515 ready\r\nStandard ID: 0x036       DLC: 1  Data: 0x13\r\n"), Format::Labelled),
         (utf8("------- CAN Read ----------\nID  DLC   DATA\n123 1 4 \n"), Format::Labelled),
+        (utf8("t12380102030405060708\rT18FEF100201021A2B\rz\r"), Format::Slcan),
+        (utf8("12:34:56.789 -> t1232AABB\r\n"), Format::Slcan),
+        (utf8("V1013\nN0042\n\x07t1230\nd123B000102030405060708090A0B0C0D0E0F10111213\n"), Format::Slcan),
+        (
+            utf8("header: \n  seq: 1\n  frame_id: ''\nid: 304\nis_rtr: False\nis_extended: False\n"),
+            Format::RosEcho,
+        ),
         (utf8("timestamp,arbitration_id,data_field,attack\n1.0,0C1,00,0\n"), Format::Table),
         (utf8("time,addr,bus,data\n"), Format::Table),
         (utf8("Index;ID;Data\n"), Format::Table),
@@ -67,13 +74,25 @@ fn files_are_known_by_their_beginning() {
         (utf8("1478198376.389427,0316,2,05,21,R\n"), Format::Table),
         (utf8("1483093132.049669        0380    000    2    30 bb\n"), Format::Table),
         (utf8("0.001 0x100 204E00000000\n"), Format::Table),
+        (utf8("0.001 1 0x100 2 20 4E\n"), Format::Table),
+        (utf8("370458000,00000394,false,0,3,00,E0,98\r\n"), Format::Csv(CsvDialect::Gvret)),
         (utf8("11T082554602;1;cf00203;cd402800043828ff\n"), Format::Table),
     ] {
         assert_eq!(Format::of_content(&head), Some(format), "{}", String::from_utf8_lossy(&head));
         let begins = FORMATS.iter().filter(|spec| (spec.begins)(&Head::of(&head)));
         assert_eq!(begins.count(), 1, "{}", String::from_utf8_lossy(&head));
     }
-    for head in ["", "rubbish", "   0.015991 1 123 Rx d 1 0A", "[8]", "{}", "VIN: 1\nID,Data\n"] {
+    for head in [
+        "",
+        "rubbish",
+        "   0.015991 1 123 Rx d 1 0A",
+        "[8]",
+        "{}",
+        "VIN: 1\nID,Data\n",
+        "t1232 0102\n",
+        "dead0\nbeef\n",
+        "S6\rO\r",
+    ] {
         assert_eq!(Format::of_content(head.as_bytes()), None, "{head}");
     }
 }

@@ -17,10 +17,12 @@ pub(super) enum Role {
     Extended,
     Remote,
     Direction,
+    /// Whether it is an error frame.
+    Error,
 }
 
 /// The names of the roles in a text of columns, in the order of [`Role`].
-pub(super) const ROLES: [(&str, Role); 9] = [
+pub(super) const ROLES: [(&str, Role); 10] = [
     ("time", Role::Time),
     ("id", Role::Id),
     ("dlc", Role::Dlc),
@@ -30,6 +32,7 @@ pub(super) const ROLES: [(&str, Role); 9] = [
     ("extended", Role::Extended),
     ("remote", Role::Remote),
     ("direction", Role::Direction),
+    ("error", Role::Error),
 ];
 
 /// How a column's cells are written.
@@ -102,7 +105,7 @@ pub(crate) enum TypedForm {
 ///
 /// A column is named as above it, or by its number from 1, as in a table without names. The meanings are `time` (`:s`, `:ms`, `:us`, `:ns`), `id`
 /// (`:hex`, `:dec`), `dlc`, `data` or `bytes`, which is the first column of one byte each (`:hex`, `:dec`), `channel` (`:0`: counts from 0),
-/// `extended`, `remote` and `direction`. What is not said after a colon is found out from the rows.
+/// `extended`, `remote`, `direction` and `error`. What is not said after a colon is found out from the rows.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Columns(pub(super) Vec<Column>);
 
@@ -183,11 +186,18 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     let plain: Vec<u8> =
         name.iter().filter(|byte| byte.is_ascii_alphanumeric()).map(u8::to_ascii_lowercase).collect();
     let plain = std::str::from_utf8(&plain).ok()?;
+    // As `rostopic echo -p` names them: all its numbers are decimal.
+    if let Some(field) = name.strip_prefix(b"field.") {
+        let (role, form) = role_of(field)?;
+        return Some((role, role.takes(Form::Decimal).then_some(Form::Decimal).or(form)));
+    }
     let stem = plain.trim_end_matches(|last: char| last.is_ascii_digit());
     if stem.len() < plain.len() && matches!(stem, "d" | "b" | "data" | "byte" | "databyte" | "db") {
         return Some((Role::Bytes, None));
     }
-    for prefix in ["timestamps", "timestamp", "timeoffset", "unixtimestamp", "unixtime", "time", "ts"] {
+    for prefix in
+        ["timestamps", "timestamp", "timeoffset", "unixtimestamp", "unixtime", "abstime", "time", "ts"]
+    {
         if let Some(unit) = plain.strip_prefix(prefix) {
             let unit = match unit {
                 "" | "stamp" | "epoch" => None,
@@ -212,10 +222,13 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         "dlc" | "len" | "length" | "datalength" | "datalen" | "candlc" => Role::Dlc,
         "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" => Role::Data,
         "bus" | "busid" | "busnumber" => return Some((Role::Channel, Some(Form::FromZero))),
-        "channel" | "chn" | "ch" | "interface" | "buschannel" | "canchannel" => Role::Channel,
-        "extended" | "ide" | "ext" | "isextended" | "extendedid" | "idtype" | "type" => Role::Extended,
-        "remote" | "rtr" | "isremote" => Role::Remote,
-        "dir" | "direction" | "rxtx" | "txrx" => Role::Direction,
+        "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" => Role::Channel,
+        "extended" | "ide" | "ext" | "isextended" | "isextendedid" | "extendedid" | "idtype" | "type" => {
+            Role::Extended
+        }
+        "remote" | "remoteedlbrsesi" | "rtr" | "isremote" | "isrtr" | "isremoteframe" => Role::Remote,
+        "error" | "er" | "iserror" | "errorframe" | "iserrorframe" => Role::Error,
+        "dir" | "direction" | "rxtx" | "txrx" | "tx" => Role::Direction,
         _ => return None,
     };
     Some((role, radix.filter(|form| role.takes(*form))))

@@ -209,11 +209,16 @@ impl Layout {
     }
 
     /// A time, an identifier, a length and as many bytes, in one cell or one each. What follows, such as a mark of an attack, has no place in
-    /// a trace, nor has the `000` between identifier and length of data sets of HCRL and CrySyS.
+    /// a trace, nor has the `000` between identifier and length of data sets of HCRL and CrySyS. A channel may stand before an identifier that has `0x`
+    /// before it.
     fn with_length(separator: Separator, cells: &[&[u8]]) -> Option<Self> {
-        let (cells, skipped) = match cells {
-            [time, id, b"000", rest @ ..] => (&[&[*time, *id], rest].concat()[..], 1),
-            _ => (cells, 0),
+        let is_channel = |cell: &[u8]| cell.len() <= 2 && text::decimal(cell).is_some();
+        let (cells, before, between) = match cells {
+            [time, id, b"000", rest @ ..] => (&[&[*time, *id], rest].concat()[..], 0, 1),
+            [time, channel, id, rest @ ..] if is_channel(channel) && text::after_0x(id).is_some() => {
+                (&[&[*time, *id], rest].concat()[..], 1, 0)
+            }
+            _ => (cells, 0, 0),
         };
         let [time, id, len, data @ ..] = cells else { return None };
         let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
@@ -231,10 +236,11 @@ impl Layout {
         let mut places = [None; ROLES.len()];
         let hex = Some(Form::Hex);
         places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
-        places[Role::Id as usize] = Some(Place { at: 1, form: hex });
-        places[Role::Dlc as usize] = Some(Place { at: 2 + skipped, form: None });
+        places[Role::Id as usize] = Some(Place { at: 1 + before, form: hex });
+        places[Role::Dlc as usize] = Some(Place { at: 2 + before + between, form: None });
+        places[Role::Channel as usize] = (before > 0).then_some(Place { at: 1, form: None });
         let role = if one_each { Role::Bytes } else { Role::Data };
-        places[role as usize] = Some(Place { at: 3 + skipped, form: hex });
+        places[role as usize] = Some(Place { at: 3 + before + between, form: hex });
         let has_others = data.len() > if one_each { len } else { 1 };
         Some(Self { places, byte_columns: usize::MAX, has_others, ..Self::empty(separator) })
     }

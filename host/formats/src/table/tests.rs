@@ -28,6 +28,46 @@ fn rows_that_begin_with_the_identifier_are_read_with_columns() {
     assert_eq!(log, lines.concat());
 }
 
+/// As `rostopic echo -p` prints them, and as pandas writes messages of python-can; an error frame is no data frame.
+#[test]
+fn rows_marked_as_error_frames_are_counted_and_not_read_as_data() {
+    let file = "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.id,field.is_rtr,field.is_extended,\
+                field.is_error,field.dlc,field.data0,field.data1,field.data2\n\
+                1520743044188934087,7,1520743044188934087,,304,0,0,0,3,0,10,92\n\
+                1520743044198934087,8,1520743044198934087,,305,0,1,0,2,10,11,4\n\
+                1520743044208934087,9,1520743044208934087,,8,0,0,1,2,0,0,0\n";
+    let (log, issues) = as_log(file);
+    assert_eq!(log, "(1520743044.188934) can0 130#000A5C\n(1520743044.198934) can0 00000131#0A0B\n");
+    assert_eq!(issues, Vec::<String>::new());
+    let file = "timestamp,arbitration_id,is_extended_id,is_remote_frame,is_error_frame,dlc,data\n\
+                1.5,0x123,True,False,False,1,11\n1.6,0x124,False,True,False,3,\n1.7,0x4,False,False,True,1,00\n";
+    let (log, issues) = as_log(file);
+    assert_eq!(log, "(1.500000) can0 00000123#11\n(1.600000) can0 124#R3\n");
+    assert_eq!(issues, Vec::<String>::new());
+}
+
+/// As Vehicle Spy exports them: lines about the networks, then names for each kind of network.
+#[test]
+fn vehicle_spys_rows_are_read_with_their_networks() {
+    let names = "Line,Abs Time(Sec),Rel Time (Sec),Status,Er,Tx,Description,Network,Node";
+    let file = format!(
+        "Vehicle Spy,Log File\nStart Date,9/3/2026\n\nNetwork Description,Hardware,Network,Protocol,Baud Rate\n\
+         {names},Arb ID,Remote/EDL-BRS-ESI,Xtd,B1,B2,B3,B4,B5,B6,B7,B8,Value,Trigger,Signals\n\
+         {names},PT,Trgt,Src,B1,B2,B3,B4,B5,B6,B7,B8,Value,Trigger,Signals\n\
+         1,2550.368293675,0.003818,67371008,F,F,HS CAN $119,HS CAN,,119,F,F,00,00,00,00,00,00,0D,8B,,,\n\
+         2,2550.368493675,0.000200,67371008,F,T,MS CAN $18FEF100,MS CAN,,18FEF100,F,T,10,11,,,,,,,,,\n\
+         3,2550.368593675,0.000100,67371008,F,F,HS CAN $120,HS CAN,,120,T-T-F,F,10,11,12,13,14,15,16,17,18 19 1A 1B,,\n\
+         4,2550.368693675,0.000100,67371008,T,F,HS CAN $0,HS CAN,,0,F,F,,,,,,,,,,,\n"
+    );
+    let (log, issues) = as_log(&file);
+    assert_eq!(log, "(2550.368293) can0 119#0000000000000D8B\n(2550.368493) can1 18FEF100#1011 T\n");
+    assert_eq!(issues.len(), 1, "{issues:?}");
+    assert!(issues[0].contains("CAN FD is not read"), "{issues:?}");
+    // Two files, one behind the other.
+    let (log, issues) = as_log("time,id,data\n1.5,0x12,01\ntime,id,data\n2.5,0x12,02\n");
+    assert_eq!((log.lines().count(), issues), (2, vec![]));
+}
+
 /// As makers of excavators export them: the machine above, and a mark of the identifier's kind.
 #[test]
 fn lines_above_the_names_are_counted_and_the_rows_below_are_read() {
@@ -63,6 +103,11 @@ fn tables_of_public_collections_are_known_and_read_whole() {
         (
             "1483093132.049669        0380    000    8    30 bb 82 00 9d 53 00 81\n1483093132.050104        0180    000    2    64 10\n",
             "(1483093132.049669) can0 380#30BB82009D530081\n(1483093132.050104) can0 180#6410\n",
+        ),
+        // A channel before the identifier.
+        (
+            "0.000000 1 0x100 8 11 22 33 44 55 66 77 88\n0.001000 2 0x18FEF100 2 AA BB\n",
+            "(0.000000) can0 100#1122334455667788\n(0.001000) can1 18FEF100#AABB\n",
         ),
         // With `0x`, or all bytes in a cell.
         (

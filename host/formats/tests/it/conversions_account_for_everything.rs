@@ -273,6 +273,16 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              12:00:00.400 -> TX: Standard ID: 0x123       DLC: 3  Data: REMOTE REQUEST FRAME\r\n",
         ),
         text(
+            Format::Slcan,
+            "O\rt12320102001E\rT18FEF10000020\rr1233EA5F\r\x07e3ooo\re1a\rsp128000\rz\rb1239000102030405060708090A0B0010\r",
+        ),
+        text(
+            Format::RosEcho,
+            "header:\n  stamp:\n    sec: 7\n    nanosec: 5\n  frame_id: can\nid: 291\nis_rtr: true\nis_extended: false\nis_error: false\ndlc: 3\n\
+             data: [0, 0, 0, 0, 0, 0, 0, 0]\n---\nheader:\n  stamp:\n    sec: 7\n    nanosec: 6\n  frame_id: can\nid: 64\nis_extended: false\n\
+             is_error: true\nlen: 8\ndata: [0, 8, 0, 0, 0, 0, 130, 0]\n---\ndata: hello\n---\n",
+        ),
+        text(
             Format::Table,
             "Timestamp,CAN ID,IDE,Bus,Dir,RTR,DLC,Data,Label\n1478198376.389427,0A5,0,0,Rx,0,2,05 21,R\n\
              1478198376.389428,18DAF110,1,1,Tx,0,0,,R\n1478198376.389429,123,0,0,Rx,1,3,,R\n\

@@ -58,6 +58,10 @@ fn row(format: Format) -> String {
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::UsbCan => ["as written, local if a date", "yes | yes | yes | yes | – | – | –"],
             Format::Labelled => ["as printed, local if a clock", "– | yes | yes | without flags | – | – | –"],
+            Format::Slcan => {
+                ["as written, local if a clock", "– | – | yes | without ESI | yes | yes | that there was one"]
+            }
+            Format::RosEcho => ["1 ns", "– | – | yes | without flags | yes | yes | –"],
             Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
             Format::Rlog => ["10 ms, an upper bound", "yes | yes | – | without flags | – | – | –"],
             Format::Mcap | Format::RosBag => {

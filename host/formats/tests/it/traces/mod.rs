@@ -46,6 +46,8 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::BatteryEmulator
         | Format::Nmea2000
         | Format::Labelled
+        | Format::Slcan
+        | Format::RosEcho
         | Format::Table => "txt",
         Format::Sqlite => "db",
         Format::Parquet => "parquet",

@@ -1,0 +1,92 @@
+//! What a cell of a table says.
+
+use super::super::issue::Fault;
+use super::super::text;
+use cantap_trace::Direction;
+use cantap_trace::fd::FD_MAX_BYTES;
+
+pub(super) fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
+    let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
+    let number = text::number(digits, decimal);
+    let expected =
+        if decimal { "an identifier in decimal digits" } else { "an identifier in hexadecimal digits" };
+    number.ok_or_else(|| Fault::malformed(expected, shown))
+}
+
+/// A length; programs that know no whole numbers write it with a fraction.
+pub(super) fn length(cell: &[u8]) -> Result<usize, Fault> {
+    let number = text::decimal(cell.strip_suffix(b".0").unwrap_or(cell));
+    let len = number.filter(|len| *len <= FD_MAX_BYTES as u64);
+    len.map(|len| len as usize).ok_or_else(|| Fault::malformed("a length of 0 to 64", cell))
+}
+
+/// Yes or no, as different programs write it; `None` for anything else.
+pub(super) fn mark(cell: &[u8]) -> Option<bool> {
+    let is = |words: &[&str]| words.iter().any(|word| cell.eq_ignore_ascii_case(word.as_bytes()));
+    if is(&[
+        "1", "true", "t", "yes", "y", "x", "e", "ext", "extended", "xtd", "29", "29-bit", "r", "rtr",
+        "remote",
+    ]) {
+        Some(true)
+    } else if is(&["0", "false", "f", "no", "n", "s", "std", "standard", "11", "11-bit", "d", "-", ""]) {
+        Some(false)
+    } else {
+        None
+    }
+}
+
+pub(super) fn direction(way: &[u8]) -> Result<Direction, Fault> {
+    let is = |words: &[&str]| words.iter().any(|word| way.eq_ignore_ascii_case(word.as_bytes()));
+    if is(&["rx", "r", "receive", "received", "in", "0", "f", "false", ""]) {
+        Ok(Direction::Rx)
+    } else if is(&["tx", "t", "transmit", "transmitted", "sent", "out", "1", "true"]) {
+        Ok(Direction::Tx)
+    } else {
+        Err(Fault::malformed("'Rx' or 'Tx'", way))
+    }
+}
+
+/// Whether a cell of a byte holds none.
+pub(super) fn is_empty(cell: &[u8]) -> bool {
+    cell.is_empty() || cell.eq_ignore_ascii_case(b"nan") || cell == b"-"
+}
+
+/// One byte.
+pub(super) fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
+    text::number(cell, decimal).and_then(|byte| u8::try_from(byte).ok())
+}
+
+/// Whether a cell is a list as Python prints one, `[78, 32, 137]`: its numbers are decimal.
+pub(super) fn is_list(cell: &[u8]) -> bool {
+    let inner = cell.strip_prefix(b"[").and_then(|cell| cell.strip_suffix(b"]"));
+    let is_number =
+        |word: &[u8]| text::decimal(word).is_some() && (word.len() == 1 || !word.starts_with(b"0"));
+    inner.is_some_and(|inner| {
+        inner.contains(&b',') && inner.split(|byte| *byte == b',').all(|word| is_number(word.trim_ascii()))
+    })
+}
+
+/// The bytes of a cell: digits without gaps, or bytes with something between them.
+pub(super) fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fault> {
+    let is_between =
+        |byte: &u8| matches!(byte, b' ' | b'-' | b':' | b',' | b';' | b'_' | b'.' | b'|' | b'[' | b']');
+    for word in cell.split(is_between).filter(|word| !word.is_empty()) {
+        let fault = || Fault::malformed("data bytes", cell);
+        // No bytes at all, as Cabana writes them.
+        if text::after_0x(word).is_some_and(<[u8]>::is_empty) {
+            continue;
+        }
+        if decimal || text::after_0x(word).unwrap_or(word).len() <= 2 {
+            bytes.push(byte(word, decimal).ok_or_else(fault)?);
+        } else {
+            let digits = text::after_0x(word).unwrap_or(word);
+            if !digits.len().is_multiple_of(2) {
+                return Err(fault());
+            }
+            for pair in digits.chunks_exact(2) {
+                bytes.push(text::hex_pair(pair[0], pair[1]).ok_or_else(fault)?);
+            }
+        }
+    }
+    Ok(())
+}

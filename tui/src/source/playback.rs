@@ -49,6 +49,9 @@ const BEFORE_JUMP_NS: i64 = 2_000_000_000;
 /// Where no more records than this lie between, a jump goes through them, so that everything stays counted: they take a tenth of a second.
 const GONE_THROUGH: u64 = if cfg!(test) { 500 } else { 100_000 };
 
+/// No jump where more records than this would have to be read for it: in most of the file something is wrong, which is reported each time.
+const MOST_READ: u64 = 500_000;
+
 impl Readable {
     /// Opens the file at its beginning, or goes on with a jump, and forgets earlier counts.
     fn open(path: &Path, progress: &Rc<Progress>) -> Result<Self, OpenError> {
@@ -79,8 +82,7 @@ impl Readable {
                 Ok(()) => {}
                 Err(issue) => issues.push(issue.to_string()),
             }
-            // Parts in which something is wrong are read, too.
-            if reader.records() - reader.passed_records() > 5 * GONE_THROUGH {
+            if reader.records() - reader.passed_records() > MOST_READ {
                 return None;
             }
         }

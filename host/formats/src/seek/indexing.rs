@@ -110,6 +110,11 @@ fn how(format: Format, options: &ReadOptions) -> String {
     format!("{format:?}, {:?}, {:?}", options.zone, options.columns)
 }
 
+/// What the system says now of the file that is read.
+fn identity_now(input: &Input) -> Option<Identity> {
+    input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about))
+}
+
 impl Indexing {
     /// For a file whose bytes are read as they are; `None` if it is not to have an index.
     pub(crate) fn of(trace: &Path, format: Format, input: &Input, options: &ReadOptions) -> Option<Self> {
@@ -284,14 +289,10 @@ impl Indexing {
 
     /// A file that is read at many places must not have changed while a part of it is read.
     pub(crate) fn check(&mut self, reading: &mut Reading<'_>) -> io::Result<()> {
-        if self.index.is_random && self.has_passed && self.identity_now(reading.input) != self.identity {
+        if self.index.is_random && self.has_passed && identity_now(reading.input) != self.identity {
             return self.distrust(reading);
         }
         Ok(())
-    }
-
-    fn identity_now(&self, input: &Input) -> Option<Identity> {
-        input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about))
     }
 
     /// Records that were read.
@@ -324,7 +325,7 @@ impl Indexing {
         if !std::mem::take(&mut self.is_new) || self.index.parts.is_empty() {
             return;
         }
-        self.index.identity = self.identity_now(input).filter(|now| Some(*now) == self.identity);
+        self.index.identity = identity_now(input).filter(|now| Some(*now) == self.identity);
         if self.index.is_random && self.index.identity.is_none() {
             return;
         }

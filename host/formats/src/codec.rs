@@ -46,6 +46,12 @@ pub(crate) trait Decode: Send {
         None
     }
 
+    /// How far the reading has come in a file that is read at many places: it grows with whatever is handed out. `None` if the file is read from its
+    /// beginning to its end.
+    fn position(&self) -> Option<u64> {
+        None
+    }
+
     /// Adds records until it finds something else, which is returned; `None` if there are enough, or if it would have to
     /// wait for more. It is in the trait so that each format's [`Self::next`] is inlined into its own loop.
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {

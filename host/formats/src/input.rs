@@ -192,10 +192,11 @@ impl Input {
     /// All of it, for formats read with random access: the file itself, or a copy in memory if it is compressed or comes
     /// through a pipe. Nothing may have been used up before.
     pub(crate) fn whole(&mut self) -> io::Result<Whole> {
-        if let Some(file) = self.file.take() {
+        if let Some(file) = &self.file {
+            let same = file.try_clone()?;
             self.consume(self.buffered().len());
             self.ended = true;
-            return Whole::new(Box::new(file));
+            return Whole::new(Box::new(same));
         }
         let mut bytes = self.buffered().to_vec();
         self.consume(bytes.len());

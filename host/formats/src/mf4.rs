@@ -19,11 +19,13 @@ mod joined;
 mod layout;
 mod order;
 mod part;
+mod place;
 mod plain;
 mod record;
+mod resume;
 mod stream;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;
 mod unpack;
 mod value;
 

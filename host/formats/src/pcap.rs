@@ -10,9 +10,11 @@ use super::found::Found;
 use super::input::Input;
 use super::interfaces::Interfaces;
 use super::issue::{Fault, Place};
+use super::seek;
 use super::socketcan_packet::{Link, Packet, Packets};
 use super::text::NS_PER_S;
 use cantap_trace::TraceRecord;
+use serde::{Deserialize, Serialize};
 
 const MICROSECONDS: u32 = 0xA1B2_C3D4;
 const NANOSECONDS: u32 = 0xA1B2_3C4D;
@@ -49,7 +51,7 @@ pub(crate) struct Decoder {
 }
 
 /// The content of a file's header.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Serialize, Deserialize)]
 struct Capture {
     big_endian: bool,
     ns_per_unit: i64,
@@ -99,6 +101,15 @@ impl Capture {
 impl Decode for Decoder {
     fn needs_one_line(&self) -> bool {
         false
+    }
+
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        self.packets.errors.is_over() && seek::save(&(self.open, &self.interfaces, self.packets.dirty), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.open, self.interfaces, self.packets.dirty) = seek::load(state)?;
+        Some(())
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {

@@ -3,7 +3,6 @@
 mod indexed;
 
 use std::borrow::Cow;
-use std::collections::BTreeSet;
 use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
@@ -18,7 +17,7 @@ use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
 use super::read_options::ReadOptions;
-use super::seek::Indexing;
+use super::seek::{Indexing, Passed};
 use super::spec::FormatSpec;
 use cantap_trace::{PlainFrame, TraceRecord, clean};
 
@@ -73,8 +72,8 @@ pub struct TraceReader {
     head: Vec<u8>,
     /// The index that is made or used, if there is one.
     indexing: Option<Box<Indexing>>,
-    /// Channels of records that were passed over.
-    passed_channels: BTreeSet<u8>,
+    /// Records that were passed over.
+    passed: Passed,
 }
 
 /// What is wrong with a line of text that has NUL bytes, such as after a crash.
@@ -205,7 +204,7 @@ impl TraceReader {
             named: None,
             head,
             indexing: None,
-            passed_channels: BTreeSet::new(),
+            passed: Passed::default(),
         }
     }
 
@@ -363,7 +362,10 @@ impl TraceReader {
                     return Beyond::Issue(self.issue(Place::Line(line), nul()));
                 }
                 self.ended = true;
-                self.keep_index();
+                if let Err(error) = self.end_index() {
+                    let place = Place::Offset(self.input.offset());
+                    return Beyond::Issue(self.issue(place, Fault::Io(error)));
+                }
                 if let Some(damage) = self.input.damage() {
                     let fault = Fault::malformed("undamaged compressed data to the end", damage.as_bytes());
                     return Beyond::Issue(self.issue(Place::Offset(self.input.offset()), fault));

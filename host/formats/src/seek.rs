@@ -7,6 +7,9 @@
 //! An index is about bytes: it has the digest of each block up to its last place. It is used if the system says that the file is the
 //! same and has not been written to since ([`identity`]), otherwise after all blocks were compared, and only up to the first that differs. Whatever
 //! is read by it is compared once more. What follows the last place, at least the end of the file, is always read.
+//!
+//! A file that is read at many places (MF4) has no such digests: its index is used only if the system says that the file is the same, before each jump
+//! and until the reading ends.
 
 mod blocks;
 mod folder;
@@ -17,9 +20,9 @@ mod state;
 #[cfg(test)]
 mod tests;
 
-pub(crate) use blocks::Blocks;
+pub(crate) use blocks::{Blocks, has_changed};
 pub use folder::IndexFolder;
-pub(crate) use indexing::{Indexing, Reading};
+pub(crate) use indexing::{Indexing, Passed, Reading};
 pub(crate) use state::{load, save};
 
 /// Bytes that have one digest.

@@ -2,6 +2,7 @@
 //! interface (113 and 276, `tcpdump -i any`).
 
 use cantap_can::{Frame, Id};
+use serde::{Deserialize, Serialize};
 
 use super::error_frames::ErrorFrames;
 use super::issue::Fault;
@@ -22,7 +23,7 @@ pub(crate) const PACKET_BYTES: usize = 16;
 pub(crate) const FD_PACKET_BYTES: usize = 8 + 64;
 
 /// What precedes a frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) enum Link {
     /// Nothing: the identifier is in network byte order.
     SocketCan,
@@ -46,7 +47,7 @@ pub(crate) enum Packet {
 pub(crate) struct Packets {
     pub errors: ErrorFrames,
     /// Whether bytes that should be zero were found not to be: then none of them has a meaning.
-    dirty: bool,
+    pub dirty: bool,
 }
 
 /// What the link says about its frame.

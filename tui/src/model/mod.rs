@@ -130,6 +130,8 @@ pub struct Model {
     pub seen: Seen,
     /// Time of the first record, since the beginning or since everything was forgotten.
     pub first_ns: Option<i64>,
+    /// From when on everything was counted, if a file's earlier records were passed over.
+    pub counted_from_ns: Option<i64>,
     /// The source.
     pub source: SourceState,
     /// How often each device was opened: a new session means that its periodic frames have ended.
@@ -172,6 +174,7 @@ impl Model {
             history: History::new(history_bytes),
             seen,
             first_ns: None,
+            counted_from_ns: None,
             source: SourceState::default(),
             sessions: Vec::new(),
             found: None,
@@ -239,6 +242,7 @@ impl Model {
         self.scripts.output.clear();
         self.seen.taken = 0;
         self.first_ns = None;
+        self.counted_from_ns = None;
         self.begin_statistics();
     }
 

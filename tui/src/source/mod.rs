@@ -18,10 +18,12 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use cantap::TraceRecord;
+use cantap_formats::IndexFolder;
 
 use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
+use cantap_work::cache;
 use cantap_work::recording::{Older, Recording};
 use session_scripts::SessionScripts;
 use timed::Timed;
@@ -66,6 +68,7 @@ pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
         recording: None,
         timed: Timed::default(),
         scripts: SessionScripts::default(),
+        indexes: cache::indexes(),
     };
     match origin {
         Origin::Device(plan) => source.run_device(plan),
@@ -80,6 +83,8 @@ struct Source<'a> {
     recording: Option<Recording>,
     timed: Timed,
     scripts: SessionScripts,
+    /// Where those of large files are kept.
+    indexes: Option<IndexFolder>,
 }
 
 impl Source<'_> {

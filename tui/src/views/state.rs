@@ -94,6 +94,10 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
         let off: Vec<String> = off.iter().map(u8::to_string).collect();
         spans.push(Span::styled(format!("  {}: BUS-OFF, R recovers", off.join(", ")), theme.error()));
     }
+    if let (Some(from_ns), SourceState::Playing(playing)) = (model.counted_from_ns, &model.source) {
+        let from = duration(from_ns.saturating_sub(playing.first_ns));
+        spans.push(Span::styled(format!("  COUNTED FROM {from}"), Theme::heading()));
+    }
     if let Some((count, _)) = &model.unread {
         spans.push(Span::styled(format!("  {count} unreadable"), theme.error()));
     }

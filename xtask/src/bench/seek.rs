@@ -2,7 +2,8 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::thread;
+use std::time::{Duration, Instant};
 
 use anyhow::{Result, ensure};
 use cantap_formats::{ReadOptions, open_reader};
@@ -17,6 +18,8 @@ const FRAMES: [u64; 2] = [21_000_000, 4_200_000];
 const PLACES: [u64; 7] = [500, 985, 20, 730, 250, 870, 120];
 /// A second is to be there within this time, in seconds.
 const WITHIN: f64 = 0.3;
+/// After this time the system's time of a file's last change shows any other.
+const SETTLED: Duration = Duration::from_secs(3);
 
 /// A trace, and where its index goes.
 struct Trace {
@@ -53,7 +56,7 @@ fn measure(shell: &Shell, folder: &Path, frames: u64) -> Result<()> {
         "index, MB"
     );
     let mut slow = Vec::new();
-    for suffix in ["log", "blf", "asc", "trc", "csv"] {
+    for suffix in ["log", "blf", "mf4", "asc", "trc", "pcapng", "csv"] {
         let path = log.with_extension(suffix);
         if path != log {
             cmd!(shell, "{program} convert {log} {path}").quiet().run()?;
@@ -81,6 +84,8 @@ impl Trace {
         let none = Path::new("/dev/null");
         let length_ns = self.length_ns()?;
         let (whole, _) = self.second(shell, none, length_ns / 2)?;
+        // An index of MF4 needs a file that was not written just now.
+        thread::sleep(SETTLED);
         let (first, _) = self.second(shell, &self.cache, length_ns / 2)?;
         // A file that was made just now is compared once more.
         self.second(shell, &self.cache, length_ns / 2)?;

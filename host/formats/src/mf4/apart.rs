@@ -1,6 +1,6 @@
 //! Values of records that are not in the records themselves.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use super::super::issue::Fault;
 use super::super::whole::Whole;
@@ -25,7 +25,7 @@ pub(super) struct Values {
 /// Whether all values of a record that are in other groups have been read.
 pub(super) fn has_arrived(
     apart: &[Apart],
-    values: &HashMap<u64, Values>,
+    values: &BTreeMap<u64, Values>,
     record: &[u8],
     by_order: bool,
 ) -> Result<bool, Fault> {
@@ -46,7 +46,7 @@ impl Apart {
     pub(super) fn take(
         &mut self,
         file: &mut Whole,
-        values: &mut HashMap<u64, Values>,
+        values: &mut BTreeMap<u64, Values>,
         record: &[u8],
         by_order: bool,
     ) -> Result<Vec<u8>, Fault> {
@@ -63,6 +63,21 @@ impl Apart {
 }
 
 impl Values {
+    /// Whether none is waiting for its record.
+    pub(super) fn is_empty(&self) -> bool {
+        self.kept.is_empty()
+    }
+
+    /// How far they were read: the place of the next, how many came, how many were requested.
+    pub(super) fn read(&self) -> (u64, u64, u64) {
+        (self.end, self.came, self.asked)
+    }
+
+    /// Those read so far, none of which is waiting.
+    pub(super) fn after((end, came, asked): (u64, u64, u64)) -> Self {
+        Self { kept: BTreeMap::new(), end, came, asked }
+    }
+
     pub(super) fn keep(&mut self, value: Vec<u8>, by_order: bool) {
         let place = if by_order { self.came } else { self.end };
         self.came += 1;

@@ -4,10 +4,11 @@ use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 use std::io;
 
-use super::super::codec::{Decode, PLAIN_BATCH};
+use super::super::codec::{BATCH, Decode, PLAIN_BATCH};
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::{Fault, Place};
+use super::super::seek;
 use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
@@ -16,8 +17,9 @@ use super::joined::{after_blocks, joined};
 use super::layout::Alone;
 use super::order::Item;
 use super::part::{OPEN_LENGTH, Part, own};
+use super::place::{EVERY, Saved};
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
-use cantap_trace::PlainFrame;
+use cantap_trace::{PlainFrame, TraceRecord};
 
 const MEASURED: &str = "groups of measured signals";
 const NO_COMMENT: &str = "what the file says about its measurement cannot be read";
@@ -29,10 +31,14 @@ pub(crate) struct Decoder {
     /// To be reported before the records.
     first: VecDeque<Found>,
     properties: Properties,
+    /// Where to go on, once the file is opened.
+    resume: Option<Saved>,
 }
 
 struct Opened {
     file: Whole,
+    /// What was handed out.
+    items: u64,
     parts: Vec<Part>,
     /// The time of the next record, for each part that has one.
     next: BinaryHeap<Reverse<(i64, usize)>>,
@@ -54,22 +60,40 @@ impl Decode for Decoder {
         Some(&self.properties)
     }
 
+    fn position(&self) -> Option<u64> {
+        let resume = || self.resume.as_ref().map_or(0, |saved| saved.position);
+        Some(self.open.as_ref().map_or_else(resume, Opened::position))
+    }
+
+    /// Before the file is opened, this is where it will be read from.
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        match &self.open {
+            None => seek::save(&self.resume, state),
+            Some(_) if !self.is_between() => false,
+            Some(open) => open.save().is_some_and(|saved| seek::save(&Some(saved), state)),
+        }
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        self.resume = seek::load(state)?;
+        Some(())
+    }
+
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+            if records.len() >= BATCH || self.is_between() || input.may_wait() {
+                return Ok(None);
+            }
+        }
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if self.open.is_none() {
-            let zone = input.zone().clone();
-            let mut file = input.whole()?;
-            let (parts, fault) = match parts(&mut file, &zone, &mut self.first, &mut self.properties) {
-                Ok(parts) => (parts, None),
-                Err((parts, fault)) => (parts, Some(fault)),
-            };
-            if let Some(fault) = fault {
-                self.first.push_back(Found::Issue(Place::Offset(0), own(fault)?));
-            }
-            let mut open = Opened { file, parts, next: BinaryHeap::new() };
-            for part in 0..open.parts.len() {
-                open.advance(part)?;
-            }
-            self.open = Some(open);
+            self.open(input)?;
         }
         if let Some(found) = self.first.pop_front() {
             return Ok(found);
@@ -81,9 +105,68 @@ impl Decode for Decoder {
     }
 }
 
+impl Decoder {
+    /// Reads what the file says about itself, and what comes first.
+    fn open(&mut self, input: &mut Input) -> io::Result<()> {
+        let zone = input.zone().clone();
+        let mut file = input.whole()?;
+        let (parts, fault) = match parts(&mut file, &zone, &mut self.first, &mut self.properties) {
+            Ok(parts) => (parts, None),
+            Err((parts, fault)) => (parts, Some(fault)),
+        };
+        if let Some(fault) = fault {
+            self.first.push_back(Found::Issue(Place::Offset(0), own(fault)?));
+        }
+        let mut open = Opened { file, items: 0, parts, next: BinaryHeap::new() };
+        let resume = self.resume.take();
+        if let Some(saved) = &resume {
+            // It was reported where the file begins.
+            self.first.clear();
+            if !open.resume(saved)? {
+                return Err(seek::has_changed());
+            }
+        }
+        for part in 0..open.parts.len() {
+            open.advance(part)?;
+        }
+        if resume.is_some_and(|saved| saved.position != open.position()) {
+            return Err(seek::has_changed());
+        }
+        self.open = Some(open);
+        Ok(())
+    }
+
+    /// Whether reading can go on from here.
+    fn is_between(&self) -> bool {
+        let is_multiple = |open: &Opened| open.items.is_multiple_of(EVERY) && open.items > 0;
+        self.first.is_empty() && self.open.as_ref().is_some_and(is_multiple)
+    }
+}
+
 impl Opened {
+    /// Grows with whatever is handed out.
+    fn position(&self) -> u64 {
+        self.parts.iter().map(|part| part.at).fold(self.items, u64::saturating_add)
+    }
+
+    fn save(&self) -> Option<Saved> {
+        let parts = self.parts.iter().map(Part::save).collect::<Option<_>>()?;
+        Some(Saved { items: self.items, position: self.position(), parts })
+    }
+
+    /// Goes to a place, before anything was read; false if it is none of this file.
+    fn resume(&mut self, saved: &Saved) -> io::Result<bool> {
+        self.items = saved.items;
+        let mut is_one = self.parts.len() == saved.parts.len();
+        for (part, saved) in self.parts.iter_mut().zip(&saved.parts) {
+            is_one = is_one && part.resume(&mut self.file, saved)?;
+        }
+        Ok(is_one)
+    }
+
     fn next(&mut self) -> io::Result<Found> {
         let Some(Reverse((_, part))) = self.next.pop() else { return Ok(Found::End) };
+        self.items += 1;
         let item = self.parts[part].next.take();
         self.advance(part)?;
         Ok(match item {
@@ -97,7 +180,8 @@ impl Opened {
     /// Appends plain frames, up to whatever else comes next.
     fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<()> {
         frames.reserve(PLAIN_BATCH);
-        while frames.len() < PLAIN_BATCH
+        let most = PLAIN_BATCH.min((EVERY - self.items % EVERY) as usize);
+        while frames.len() < most
             && let Some(Reverse((_, index))) = self.next.peek().copied()
             && let Some(Item::Record(record)) = &self.parts[index].next
             && let Some(frame) = PlainFrame::of(record)
@@ -106,9 +190,10 @@ impl Opened {
             frames.push(frame);
             let others = self.next.peek().map(|Reverse(first)| *first);
             let is_next = |time_ns| others.is_none_or(|first| (time_ns, index) < first);
-            self.parts[index].plain_frames(frames, is_next);
+            self.parts[index].plain_frames(frames, most, is_next);
             self.advance(index)?;
         }
+        self.items += frames.len() as u64;
         Ok(())
     }
 

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use cantap_trace::TraceRecord;
 
 use super::super::issue::Fault;
+use super::place::{Ahead, Known};
 
 /// What a part yields next.
 pub(super) enum Item {
@@ -74,7 +75,42 @@ impl Order {
         self.count += 1;
     }
 
-    pub fn pop(&mut self) -> Option<Item> {
-        self.items.pop_first().map(|(_, item)| item)
+    /// The first, and its number.
+    pub fn pop(&mut self) -> Option<(u64, Item)> {
+        self.items.pop_first().map(|((_, number), item)| (number, item))
+    }
+
+    /// How many were read.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// What is known now, to go on from here when what was read ahead has been handed out.
+    pub fn known(&self) -> Known {
+        Known { count: self.count, latest_ns: self.latest_ns, last: self.last.clone() }
+    }
+
+    /// The lowest number of those that were read ahead.
+    pub fn first_number(&self) -> Option<u64> {
+        self.items.keys().map(|(_, number)| *number).min()
+    }
+
+    /// What was read ahead since a mark, and `next` besides, which was taken out last; all have come after the mark.
+    pub fn ahead(&self, mark: &Known, next: Option<u64>) -> Ahead {
+        let mut numbers: Vec<_> = self.items.keys().map(|(_, number)| *number).chain(next).collect();
+        numbers.sort_unstable();
+        Ahead::of(mark.clone(), self.count, &numbers, self.ended)
+    }
+
+    /// As it was at a mark; `None` if that is of another number of groups.
+    pub fn at(mark: &Known, groups: usize) -> Option<Self> {
+        let Known { count, latest_ns, last } = mark.clone();
+        (last.len() == groups).then(|| Self { items: BTreeMap::new(), last, latest_ns, count, ended: false })
+    }
+
+    /// Forgets all but these, which are sorted.
+    pub fn keep(&mut self, numbers: &[u64], ended: bool) {
+        self.items.retain(|(_, number), _| numbers.binary_search(number).is_ok());
+        self.ended = ended;
     }
 }

@@ -1,11 +1,10 @@
 //! One stream of records in an MF4 file: those of one group, or of several in turn.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io;
 
 use cantap_trace::PlainFrame;
 
-use super::super::codec::PLAIN_BATCH;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::apart::{MAX_APART, Values, has_arrived};
@@ -14,6 +13,7 @@ use super::channel::Row;
 use super::joined::joined;
 use super::layout::{Alone, Content, Group, RecordBytes, Times};
 use super::order::{Item, Order};
+use super::place::{Cursor, Mark};
 use super::plain::Plain;
 use super::stream::Stream;
 
@@ -32,42 +32,47 @@ pub(super) struct Part {
     start_ns: i64,
     /// Bytes before each record that identify its group.
     id_bytes: usize,
-    groups: Vec<Group>,
+    pub(super) groups: Vec<Group>,
     /// For those whose records are plain frames at fixed places.
     plain: Vec<Option<Plain>>,
     /// Bytes of a record of each group in the stream.
     record_bytes: Vec<usize>,
     by_id: HashMap<u64, usize>,
     /// Groups whose records are the bytes of another group's records, by address.
-    values: HashMap<u64, Values>,
+    pub(super) values: BTreeMap<u64, Values>,
     by_order: bool,
-    stream: Stream,
-    at: u64,
+    pub(super) stream: Stream,
+    pub(super) at: u64,
     /// Number of records of each group so far.
-    counts: Vec<u64>,
+    pub(super) counts: Vec<u64>,
     /// If sorted: the number of records.
     records: u64,
     /// Whether the file contains the number of records in each group.
     is_counted: bool,
-    waiting: VecDeque<Waiting>,
+    pub(super) waiting: VecDeque<Waiting>,
     /// How many records were dropped because their values never came, and where the first was.
-    without_values: u64,
-    first_without: u64,
+    pub(super) without_values: u64,
+    pub(super) first_without: u64,
     /// Whether the file ends inside a record, which has been said.
-    is_cut: bool,
-    is_end_checked: bool,
+    pub(super) is_cut: bool,
+    pub(super) is_end_checked: bool,
     /// That of the last record that has one.
     pub time_ns: i64,
     pub next: Option<Item>,
-    ended: bool,
+    /// Where reading was before it, if nothing waited there; among those put in order, its number.
+    pub(super) before: Option<Cursor>,
+    pub(super) next_number: Option<u64>,
+    pub(super) ended: bool,
     /// The group of the last record.
     group: usize,
     /// If frames of several groups follow each other: what was read ahead.
-    order: Option<Order>,
+    pub(super) order: Option<Order>,
+    /// Where reading can go on from, in order: the first is before all that was read ahead.
+    pub(super) marks: VecDeque<Mark>,
 }
 
 /// A record whose values may be elsewhere.
-struct Waiting {
+pub(super) struct Waiting {
     group: usize,
     /// Its number in its group.
     number: u64,
@@ -152,22 +157,37 @@ impl Part {
             is_end_checked: false,
             time_ns: start_ns,
             next: None,
+            before: None,
+            next_number: None,
             ended: false,
             group: 0,
             order,
+            marks: VecDeque::new(),
         };
         Ok((Some(part), signals, faults))
     }
 
     /// What comes next, in the order of time.
     pub fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
-        let Some(mut order) = self.order.take() else { return self.read(file) };
+        let Some(mut order) = self.order.take() else {
+            self.remember();
+            return self.read(file);
+        };
+        self.next_number = None;
         while order.needs_more() {
-            order.put(self.read(file)?, self.group);
+            self.put_next(&mut order, file)?;
         }
         let first = order.pop();
         self.order = Some(order);
-        Ok(first)
+        self.next_number = first.as_ref().map(|(number, _)| *number);
+        Ok(first.map(|(_, item)| item))
+    }
+
+    /// Reads what comes next in the file, and puts it in order.
+    pub(super) fn put_next(&mut self, order: &mut Order, file: &mut Whole) -> io::Result<()> {
+        self.mark(order);
+        order.put(self.read(file)?, self.group);
+        Ok(())
     }
 
     /// What comes next in the file.
@@ -252,12 +272,12 @@ impl Part {
         }
     }
 
-    /// Appends the plain frames that follow and are at hand, as long as it is their turn; what comes then is for [`Self::advance`].
-    pub fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>, is_next: impl Fn(i64) -> bool) {
+    /// Appends the plain frames that follow and are at hand, as long as it is their turn, up to `most` altogether; what comes then is for [`Self::advance`].
+    pub fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>, most: usize, is_next: impl Fn(i64) -> bool) {
         if self.ended || self.order.is_some() || !self.waiting.is_empty() {
             return;
         }
-        let room = PLAIN_BATCH.saturating_sub(frames.len());
+        let room = most.saturating_sub(frames.len());
         let Self { stream, at, plain, record_bytes, counts, records, .. } = self;
         if self.id_bytes == 0 {
             let Some(plain) = &plain[0] else { return };

@@ -1,7 +1,7 @@
 //! Files arranged like those of other programs, made by hand: bytes stored apart from their records, data in
 //! lists, compressed.
 
-mod any_layout;
+pub(crate) mod any_layout;
 mod canedge;
 
 use std::io::Write;
@@ -343,6 +343,57 @@ fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
     let mut file = finish(blocks, received, data_at, 1, 5);
     file.extend([&b"##DT\0\0\0\0"[..], &24_u64.to_le_bytes(), &[0; 8], &data].concat());
     assert_eq!(as_log(&file), (log(), Vec::new()));
+}
+
+/// A frame in a file whose records say of which of two groups they are, and have their bytes in records of a third.
+#[derive(Clone, Debug)]
+pub(crate) struct Scattered {
+    /// Half a millisecond after the last, and so many more.
+    pub pause: u16,
+    pub is_sent: bool,
+    /// So many frames late in the file, if it is sent.
+    pub late: u8,
+    pub value: Vec<u8>,
+    pub value_first: bool,
+}
+
+/// Such a file, as loggers leave it unfinished: a tenth of a frame may stand behind its successors.
+pub(crate) fn scattered(frames: &[Scattered], by_order: bool) -> Vec<u8> {
+    let (mut blocks, received, bytes) = begin();
+    let link = |blocks: &Blocks, at: usize| {
+        u64::from_le_bytes(blocks.0[received as usize + 24 + at * 8..][..8].try_into().unwrap())
+    };
+    let values = group(&mut blocks, 2, 1, 0, [0; 3]);
+    let of_sent = [values, link(&blocks, 1), link(&blocks, 3)];
+    let sent = group(&mut blocks, 3, 0, RECORD_BYTES as u32, of_sent);
+    blocks.0[received as usize + 24..][..8].copy_from_slice(&sent.to_le_bytes());
+    blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+    let mut at = 0;
+    let times: Vec<usize> = frames
+        .iter()
+        .map(|frame| {
+            at += usize::from(frame.pause) + 1;
+            at
+        })
+        .collect();
+    let mut order: Vec<usize> = (0..frames.len()).collect();
+    order.sort_by_key(|at| at + if frames[*at].is_sent { usize::from(frames[*at].late) } else { 0 });
+    let (mut data, mut place) = (Vec::new(), 0);
+    for at in order {
+        let Scattered { is_sent, value, value_first, .. } = &frames[at];
+        let told = if by_order { 0 } else { place };
+        let group = if *is_sent { 3 } else { 1 };
+        let frame = [vec![group], record(times[at], at as u32 % 0x800, value.len(), told)].concat();
+        place += 4 + value.len() as u64;
+        let value = [&[2][..], &(value.len() as u32).to_le_bytes(), value].concat();
+        let (first, second) = if *value_first { (value, frame) } else { (frame, value) };
+        data.extend(first);
+        data.extend(second);
+    }
+    let data_at = blocks.0.len() as u64 + 24 + 32 + 8;
+    let mut file = finish(blocks, received, data_at, 1, if by_order { 0x45 } else { 5 });
+    file.extend([&b"##DT\0\0\0\0"[..], &24_u64.to_le_bytes(), &[0; 8], &data].concat());
+    file
 }
 
 /// Found by random damage: a cut after the version's first digits crashed the program.

@@ -7,6 +7,7 @@ use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::interfaces::Interfaces;
 use super::super::issue::{Fault, Place};
+use super::super::seek;
 use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
@@ -15,6 +16,7 @@ use super::{
     OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER, SIMPLE_PACKET, STATISTICS,
 };
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use serde::{Deserialize, Serialize};
 
 /// Longest block of a trace; far longer than a CAN packet.
 const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
@@ -34,7 +36,7 @@ pub(crate) struct Decoder {
 }
 
 /// The content of an interface description.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Serialize, Deserialize)]
 struct Interface {
     /// `None` if it does not carry CAN.
     link: Option<Link>,
@@ -112,6 +114,21 @@ impl<'a> Fields<'a> {
 impl Decode for Decoder {
     fn needs_one_line(&self) -> bool {
         false
+    }
+
+    fn save(&self, state: &mut Vec<u8>) -> bool {
+        /// With more interfaces reading begins nowhere else: each place has them all.
+        const MOST_INTERFACES: usize = 256;
+        let Self { big_endian, started, interfaces, names, cooked, packets } = self;
+        packets.errors.is_over()
+            && interfaces.len() <= MOST_INTERFACES
+            && seek::save(&(big_endian, started, interfaces, names, cooked, packets.dirty), state)
+    }
+
+    fn restore(&mut self, state: &[u8]) -> Option<()> {
+        (self.big_endian, self.started, self.interfaces, self.names, self.cooked, self.packets.dirty) =
+            seek::load(state)?;
+        Some(())
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {

@@ -22,7 +22,18 @@ impl TraceReader {
 
     /// The channels of the records that [`Self::within`] has left out so far.
     pub fn passed_channels(&self) -> impl Iterator<Item = u8> {
-        self.passed_channels.iter().copied()
+        self.passed.channels.iter().copied()
+    }
+
+    /// How many records [`Self::within`] has left out so far; they are among [`Self::records`].
+    pub fn passed_records(&self) -> u64 {
+        self.passed.records
+    }
+
+    /// The latest time of the records that [`Self::within`] has left out so far, in nanoseconds as in
+    /// [`TraceRecord::time_ns`](cantap_trace::TraceRecord::time_ns).
+    pub fn passed_latest_ns(&self) -> Option<i64> {
+        self.passed.latest_ns
     }
 
     /// Does something with the index, if there is one, and gives it up if it returns false.
@@ -37,7 +48,7 @@ impl TraceReader {
             records: &mut self.records,
             notes: &mut self.notes,
             left_out: &mut self.left_out,
-            channels: &mut self.passed_channels,
+            passed: &mut self.passed,
             issues: self.issues,
         };
         if with(&mut indexing, &mut reading)? {
@@ -55,6 +66,13 @@ impl TraceReader {
             indexing.step(reading)?;
             Ok(true)
         })
+    }
+
+    /// At the end of the file.
+    pub(super) fn end_index(&mut self) -> io::Result<()> {
+        self.indexed(|indexing, reading| indexing.check(reading).map(|()| true))?;
+        self.keep_index();
+        Ok(())
     }
 
     /// At the end of the reading.

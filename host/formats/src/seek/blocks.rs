@@ -14,7 +14,7 @@ fn digest(block: &[u8]) -> Digest {
 }
 
 /// Why reading ends where the file is not what its index is about.
-pub(super) fn has_changed() -> io::Error {
+pub(crate) fn has_changed() -> io::Error {
     io::Error::other("the file has changed since its index was made, which is deleted; read it again")
 }
 

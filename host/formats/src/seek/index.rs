@@ -8,9 +8,10 @@ use super::identity::Identity;
 use super::{BLOCK_BYTES, STEP_BYTES};
 use crate::LeftOut;
 
-/// Which cantap made it: decoders of another version may have another state, or read something else out of the same bytes. The number
-/// changes with whatever is stored, the version with everything else.
-const MADE_BY: &str = concat!("cantap index 1, ", env!("CARGO_PKG_VERSION"));
+/// Which cantap made it: other decoders may have another state, or read something else out of the same bytes. So it has the hash of the
+/// sources, which `build.rs` makes, besides the version, which stands for those of other packages.
+const MADE_BY: &str =
+    concat!("cantap index, ", env!("CARGO_PKG_VERSION"), ", ", env!("CANTAP_FORMATS_SOURCES"));
 
 /// Longest description of what was left out.
 const MOST_TEXT_BYTES: usize = 400;
@@ -46,6 +47,8 @@ pub(super) struct Part {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Index {
     pub identity: Option<Identity>,
+    /// Whether the file is read at many places: then there are no digests.
+    pub is_random: bool,
     /// Of the first record.
     pub first_ns: Option<i64>,
     pub places: Vec<Place>,
@@ -62,6 +65,7 @@ struct Stored<'a> {
     /// What it depends on besides the file: how that is read.
     how: &'a str,
     identity: Option<Identity>,
+    is_random: bool,
     first_ns: Option<i64>,
     places: Vec<Place>,
     parts: Vec<Part>,
@@ -87,8 +91,8 @@ fn kept(text: &str) -> Option<&'static str> {
 
 impl Index {
     /// One without parts.
-    pub(super) fn beginning_at(place: Place) -> Self {
-        Self { places: vec![place], ..Self::default() }
+    pub(super) fn beginning_at(place: Place, is_random: bool) -> Self {
+        Self { places: vec![place], is_random, ..Self::default() }
     }
 
     /// The last place.
@@ -154,6 +158,7 @@ impl Index {
             made_by: MADE_BY,
             how,
             identity: self.identity,
+            is_random: self.is_random,
             first_ns: self.first_ns,
             places: self.places.clone(),
             parts: self.parts.clone(),
@@ -183,11 +188,12 @@ impl Index {
             && places
                 .windows(2)
                 .all(|pair| pair[0].offset < pair[1].offset && pair[0].lines <= pair[1].lines)
-            && places.last().is_some_and(|end| end.offset <= blocks.bytes())
+            && (stored.is_random && stored.identity.is_some()
+                || places.last().is_some_and(|end| end.offset <= blocks.bytes()))
             && stored.parts.iter().all(|part| is_known(&part.notes) && is_known(&part.left_out));
         is_one.then_some(())?;
-        let Stored { identity, first_ns, places, parts, .. } = stored;
-        Some(Self { identity, first_ns, places, parts, texts, blocks })
+        let Stored { identity, is_random, first_ns, places, parts, .. } = stored;
+        Some(Self { identity, is_random, first_ns, places, parts, texts, blocks })
     }
 
     /// Whether it is time for another place.
@@ -202,6 +208,9 @@ impl Index {
 
     /// Keeps only what its digests prove.
     pub(super) fn prove(&mut self) {
+        if self.is_random {
+            return;
+        }
         self.cut(self.blocks.bytes());
         let needed = self.end().map_or(0, |end| end.offset.div_ceil(BLOCK_BYTES as u64));
         self.blocks.digests.truncate(needed as usize);

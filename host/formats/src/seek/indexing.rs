@@ -17,6 +17,15 @@ use crate::spec::FormatSpec;
 use crate::time_range::TimeRange;
 use crate::{Format, LeftOut, ReadOptions};
 
+/// What is known of records that are passed over.
+#[derive(Default)]
+pub(crate) struct Passed {
+    pub records: u64,
+    /// The latest time of them.
+    pub latest_ns: Option<i64>,
+    pub channels: BTreeSet<u8>,
+}
+
 /// What a reading changes besides the index.
 pub(crate) struct Reading<'a> {
     pub input: &'a mut Input,
@@ -24,8 +33,7 @@ pub(crate) struct Reading<'a> {
     pub records: &'a mut u64,
     pub notes: &'a mut LeftOut,
     pub left_out: &'a mut LeftOut,
-    /// Those of records that are passed over.
-    pub channels: &'a mut BTreeSet<u8>,
+    pub passed: &'a mut Passed,
     pub issues: u64,
 }
 
@@ -64,6 +72,13 @@ struct Open {
     left_out: LeftOut,
 }
 
+impl Reading<'_> {
+    /// How far it has come.
+    fn position(&self) -> u64 {
+        self.decoder.position().unwrap_or_else(|| self.input.offset())
+    }
+}
+
 impl Open {
     fn of(reading: &Reading<'_>) -> Self {
         Self::after(reading.issues, reading.notes.clone(), reading.left_out.clone())
@@ -93,6 +108,11 @@ impl Open {
 /// What an index depends on besides the file.
 fn how(format: Format, options: &ReadOptions) -> String {
     format!("{format:?}, {:?}, {:?}", options.zone, options.columns)
+}
+
+/// What the system says now of the file that is read.
+fn identity_now(input: &Input) -> Option<Identity> {
+    input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about))
 }
 
 impl Indexing {
@@ -133,10 +153,15 @@ impl Indexing {
         if !reading.decoder.save(&mut state) {
             return Ok(false);
         }
-        let stored = IndexFolder::load(&self.path, &self.how);
+        let is_random = reading.decoder.position().is_some();
+        if is_random && self.identity.is_none() {
+            return Ok(false);
+        }
+        let stored = IndexFolder::load(&self.path, &self.how).filter(|index| index.is_random == is_random);
         let is_same = |index: &Index| index.identity.is_some() && index.identity == self.identity;
         let stored_is_same = stored.as_ref().is_some_and(is_same);
-        let first = Place { offset: reading.input.offset(), lines: 0, state };
+        let stored = stored.filter(|_| stored_is_same || !is_random);
+        let first = Place { offset: reading.position(), lines: 0, state };
         let usable = match (range, stored) {
             (None, _) if stored_is_same => return Ok(false),
             (Some(range), Some(mut index)) => {
@@ -159,8 +184,11 @@ impl Indexing {
             self.range = None;
             self.is_learning = true;
             self.open = Open::of(reading);
-            Index::beginning_at(first.clone())
+            Index::beginning_at(first.clone(), is_random)
         };
+        if is_random {
+            return Ok(true);
+        }
         reading.input.set_blocks(Some(std::mem::take(&mut self.index.blocks)));
         reading.input.seek_to(first.offset, 0)?;
         Ok(true)
@@ -168,10 +196,12 @@ impl Indexing {
 
     /// Between two batches: learns a place, or goes on to the next part in which there is anything.
     pub(crate) fn step(&mut self, reading: &mut Reading<'_>) -> io::Result<()> {
-        let offset = reading.input.offset();
+        self.check(reading)?;
+        let offset = reading.position();
         if self.is_learning {
             // At the file's end may be a part of a line, of which the rest is still to be written.
-            let is_end = |input: &mut Input| input.peek(1).map(<[u8]>::is_empty);
+            let is_random = self.index.is_random;
+            let is_end = |input: &mut Input| Ok::<_, io::Error>(!is_random && input.peek(1)?.is_empty());
             if self.index.is_due(offset) && !reading.input.has_nul_line() && !is_end(reading.input)? {
                 self.learn(reading, offset);
             }
@@ -231,11 +261,17 @@ impl Indexing {
             return self.distrust(reading).map(|()| false);
         }
         self.has_passed = true;
-        reading.input.seek_to(place.offset, place.lines)?;
+        if !self.index.is_random {
+            reading.input.seek_to(place.offset, place.lines)?;
+        }
         *reading.decoder = decoder;
         for part in &self.index.parts[from..to] {
             *reading.records += part.records;
-            reading.channels.extend(&part.channels);
+            if part.records > 0 {
+                reading.passed.latest_ns = reading.passed.latest_ns.max(Some(part.max_ns));
+            }
+            reading.passed.records += part.records;
+            reading.passed.channels.extend(&part.channels);
             self.index.pass(part, reading.notes, reading.left_out);
         }
         Ok(true)
@@ -249,6 +285,14 @@ impl Indexing {
         reading.input.set_blocks(None);
         IndexFolder::forget(&self.path);
         if self.has_passed { Err(has_changed()) } else { Ok(()) }
+    }
+
+    /// A file that is read at many places must not have changed while a part of it is read.
+    pub(crate) fn check(&mut self, reading: &mut Reading<'_>) -> io::Result<()> {
+        if self.index.is_random && self.has_passed && identity_now(reading.input) != self.identity {
+            return self.distrust(reading);
+        }
+        Ok(())
     }
 
     /// Records that were read.
@@ -270,18 +314,21 @@ impl Indexing {
 
     /// At the end of the reading: keeps the index, if there is more in it than before.
     pub(crate) fn finish(&mut self, input: &mut Input) {
-        let Some(blocks) = input.take_blocks() else { return };
-        if blocks.differs {
-            return IndexFolder::forget(&self.path);
+        if !self.index.is_random {
+            let Some(blocks) = input.take_blocks() else { return };
+            if blocks.differs {
+                return IndexFolder::forget(&self.path);
+            }
+            self.index.blocks = blocks;
+            self.index.prove();
         }
-        self.index.blocks = blocks;
-        self.index.prove();
         if !std::mem::take(&mut self.is_new) || self.index.parts.is_empty() {
             return;
         }
-        let now =
-            input.file().and_then(|file| File::metadata(file).ok()).and_then(|about| Identity::of(&about));
-        self.index.identity = now.filter(|now| Some(*now) == self.identity);
+        self.index.identity = identity_now(input).filter(|now| Some(*now) == self.identity);
+        if self.index.is_random && self.index.identity.is_none() {
+            return;
+        }
         self.folder.keep(&self.path, &self.index, &self.how);
     }
 }

@@ -1,5 +1,7 @@
 //! What is read by an index is what a reading of the whole file gives.
 
+mod others;
+
 use std::fs;
 use std::path::Path;
 
@@ -121,6 +123,8 @@ const FORMATS: &[Format] = &[
     Format::Csv(CsvDialect::Full),
     Format::Csv(CsvDialect::Analyser),
     Format::Csv(CsvDialect::Gvret),
+    Format::Pcapng,
+    Format::Mf4,
 ];
 
 fn any_range(times: Vec<i64>) -> impl Strategy<Value = TimeRange> {

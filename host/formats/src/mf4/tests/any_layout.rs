@@ -77,13 +77,18 @@ fn group() -> impl Strategy<Value = Group> {
         })
 }
 
-fn layout() -> impl Strategy<Value = Layout> {
+/// A file with so many records at most.
+pub(crate) fn any_file(most_records: usize) -> impl Strategy<Value = Vec<u8>> {
+    layout(most_records).prop_map(|layout| layout.file())
+}
+
+fn layout(most_records: usize) -> impl Strategy<Value = Layout> {
     let number = prop::sample::select(vec![0_u8, 0, 0, 0, 1, 2, 4, 8, 8, 0x3F, 0x40, 0x80, 0xFF]);
     let record = (any::<u8>(), prop::array::uniform12(number));
     (
         prop::collection::vec(group(), 1..3),
         prop::sample::select(vec![0_u8, 0, 1, 2, 8]),
-        prop::collection::vec(record, 0..60),
+        prop::collection::vec(record, 0..most_records),
         prop::collection::vec((any::<prop::sample::Index>(), 0..3_u8), 1..4),
     )
         .prop_map(|(mut groups, id_bytes, records, pieces)| {
@@ -165,7 +170,7 @@ proptest! {
 
     #[test]
     fn plain_frames_are_the_records_whatever_the_layout_and_the_damage(
-        layout in layout(),
+        layout in layout(60),
         damage in prop::collection::vec((any::<prop::sample::Index>(), any::<u8>()), 0..4),
         keep in prop::option::weighted(0.2, any::<prop::sample::Index>()),
     ) {

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -253,6 +254,31 @@ def test_an_entry_of_somebody_else_removes_nothing_outside_of_the_lake(traces, t
         ingest(traces / "007", lake, db=tmp_path / "car.dbc")
         assert victim.read_bytes() == b"precious", name
     assert len(rows(lake)) == 60 and list(Store(lake).problems()) == []
+
+
+def test_a_link_in_a_lake_of_somebody_else_leads_nowhere(traces, tmp_path):
+    lake, elsewhere = tmp_path / "lake", tmp_path / "elsewhere"
+    ingest(traces / "007", lake)
+    name = sorted(Store(lake).files("frames"))[0]
+    # A vehicle's folder, and then a file: what they lead to has the names that the ledger expects.
+    folder = (lake / name).parent
+    shutil.move(folder, elsewhere)
+    folder.symlink_to(elsewhere, target_is_directory=True)
+    before = {path.name: path.read_bytes() for path in elsewhere.iterdir()}
+    with pytest.raises(store.StoreError, match="link"):
+        Store(lake).dataset("frames")
+    assert any("link" in problem for problem in Store(lake).problems())
+    # Of other databases the traces have other rows, which take the place of those.
+    for action in (lambda: ingest(traces / "007", lake, db=tmp_path / "car.dbc"), lambda: Store(lake).forget(), lambda: ingest(traces / "007", lake)):
+        with suppress(store.StoreError):
+            action()
+        assert {path.name: path.read_bytes() for path in elsewhere.iterdir()} == before
+    folder.unlink()
+    shutil.rmtree(lake / "ledger")
+    (lake / "ledger").symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(store.StoreError, match="is a link"):
+        ingest(traces / "007", lake)
+    assert {path.name: path.read_bytes() for path in elsewhere.iterdir()} == before
 
 
 def test_an_entry_is_called_by_its_content(traces, tmp_path):

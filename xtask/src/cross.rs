@@ -57,6 +57,8 @@ pub const SYSTEMS: &[Check] = &[
             "cantap",
             "-p",
             "cantap-formats",
+            "-p",
+            "cantap-vendor",
             "--no-default-features",
             "--features",
             "cantap/serial",

@@ -159,6 +159,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut summary = Summary::of(seconds, channels, &live, &boards);
     summary.trigger = trigger;
     summary.frames_in_file = if failed { frames_in_file(args) } else { None };
+    summary.is_closed = matches!(finished, Ok(false));
     summary.tell(args.json, args.output.as_deref())?;
     end?;
     finished?;

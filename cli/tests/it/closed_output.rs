@@ -65,3 +65,14 @@ fn output_that_nobody_takes_panics_no_command() {
     let wrong = wrong.into_inner().unwrap();
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
+
+/// What it counts was received; nobody knows what of it was read.
+#[test]
+fn a_capture_whose_reader_went_claims_no_frame_to_have_been_taken() {
+    let (ended, told) = run(1000, "capture -d virtual:load=50 -b 500k -t 30s", Out::Closed);
+    let closed =
+        "standard output was closed before the end: how many of these frames its reader took is not known";
+    assert!(ended == Some(0) && told.lines().any(|line| line == closed), "{told}");
+    let (_, told) = run(1001, "capture -d virtual:load=50 -b 500k -t 100ms -o all.log", Out::Closed);
+    assert!(told.contains("channel 1: ") && !told.contains("was closed"), "{told}");
+}

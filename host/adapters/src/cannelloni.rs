@@ -7,7 +7,7 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
-use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
+use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item, receive};
 use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, FdFrame, Frame, Refusal};
 
@@ -45,10 +45,11 @@ impl Cannelloni {
         // Only this peer is heard.
         socket.connect(place)?;
         socket.set_read_timeout(Some(READ_TIMEOUT))?;
+        let peer = socket.peer_addr()?;
         let receiver = socket.try_clone()?;
         let mut buffer = vec![0; MAX_DATAGRAM];
-        let source = Source::start(true, move || match receiver.recv(&mut buffer) {
-            Ok(len) => Ok(Some(buffer[..len].to_vec())),
+        let source = Source::start(true, move || match receive(&receiver, peer, &mut buffer) {
+            Ok(len) => Ok(len.map(|len| buffer[..len].to_vec())),
             // Nobody listens at the other end yet.
             Err(error) if is_idle(&error) || error.kind() == io::ErrorKind::ConnectionRefused => Ok(None),
             Err(error) => Err(error.to_string()),

@@ -4,6 +4,8 @@
 //! is remote. There is no time in it, UDP may lose or reorder, and nothing says who sent it.
 
 use std::hash::{DefaultHasher, Hasher as _};
+use std::io;
+use std::net::{SocketAddr, UdpSocket};
 
 use cantap_can::fd::{FLAG_BRS, FLAG_ESI};
 use cantap_can::{FdFrame, Frame, Id};
@@ -41,6 +43,13 @@ pub enum NoDatagram {
     TooShort,
     /// It is of another version, or no data.
     Other,
+}
+
+/// Waits for the next datagram of a peer to which the socket is connected, and returns its length; `None` if it was somebody else's, which arrived
+/// before the socket was connected, and which the system then hands over as the peer's.
+pub fn receive(socket: &UdpSocket, peer: SocketAddr, buffer: &mut [u8]) -> io::Result<Option<usize>> {
+    let (len, from) = socket.recv_from(buffer)?;
+    Ok((from == peer).then_some(len))
 }
 
 /// One of a datagram's frames.
@@ -224,6 +233,19 @@ mod tests {
                 proptest::prop_assert!(rest.len() < bytes.len());
             }
         }
+    }
+
+    /// Between binding and connecting, anybody can leave a datagram, which the system hands over afterwards.
+    #[test]
+    fn what_a_stranger_left_before_the_socket_was_connected_is_not_the_peer_s() {
+        let [stranger, peer, socket] = [(); 3].map(|()| UdpSocket::bind("127.0.0.1:0").unwrap());
+        let (own, from) = (socket.local_addr().unwrap(), peer.local_addr().unwrap());
+        stranger.send_to(&[VERSION, DATA, 0, 0, 0], own).unwrap();
+        socket.connect(from).unwrap();
+        peer.send_to(&[VERSION, DATA, 1, 0, 0], own).unwrap();
+        let mut buffer = [0; 16];
+        let received: Vec<_> = (0..2).map(|_| receive(&socket, from, &mut buffer).unwrap()).collect();
+        assert_eq!(received, [None, Some(HEADER)]);
     }
 
     #[test]

@@ -108,7 +108,14 @@ pub enum Command {
         /// The frame.
         frame: Frame,
     },
-    /// Send a frame that is none: its identifier is too large, or it has more than 8 bytes.
+    /// Send a CAN FD frame. There are no flags: they are as if the bit rate was switched. ESP32RET has no such command, so it is never written.
+    Fd {
+        /// The bus, from 0.
+        bus: u8,
+        /// The frame.
+        frame: FdFrame,
+    },
+    /// Send a frame that is none: its identifier is too large, or no frame has so many bytes.
     NoFrame {
         /// The bus, from 0.
         bus: u8,
@@ -246,18 +253,21 @@ pub fn command(bytes: &[u8]) -> Option<(Command, usize)> {
     let (&kind, content) = rest.split_first()?;
     let of_len = |len: usize| content.get(..len).map(|_| (Command::Other(kind), 2 + len));
     Some(match kind {
-        FRAME | ECHO_FRAME => {
+        // SavvyCAN has the same command for longer frames; GEVCU7 reads one of its own, with the same content.
+        FRAME | ECHO_FRAME | FD_FRAME => {
             let (raw, bus, len) = (u32_at(content, 0)?, *content.get(4)?, usize::from(*content.get(5)?));
             if len > MAX_FD_LEN {
                 return Some((Command::Garbage, 1));
             }
             let data = content.get(6..6 + len)?;
             content.get(6 + len)?;
-            let frame = id_of(raw).and_then(|id| Frame::data_frame(id, data));
+            let id = id_of(raw).filter(|_| kind != FD_FRAME);
+            let frame = id.and_then(|id| Frame::data_frame(id, data));
+            let fd = || id_of(raw).and_then(|id| FdFrame::new(id, true, false, data));
             let command = match frame {
                 _ if kind == ECHO_FRAME => Command::Other(kind),
                 Some(frame) => Command::Frame { bus, frame },
-                None => Command::NoFrame { bus },
+                None => fd().map_or(Command::NoFrame { bus }, |frame| Command::Fd { bus, frame }),
             };
             (command, 2 + 6 + len + 1)
         }
@@ -284,7 +294,7 @@ impl Command {
         let kind = match self {
             Self::Binary => return out.push(BINARY),
             Self::Padding => return out.push(0),
-            Self::NoFrame { .. } | Self::Other(_) | Self::Garbage => return,
+            Self::Fd { .. } | Self::NoFrame { .. } | Self::Other(_) | Self::Garbage => return,
             Self::Frame { .. } => FRAME,
             Self::Time => TIME,
             Self::SetBuses(_) => SET_BUSES,
@@ -455,9 +465,23 @@ mod tests {
         for cut in 0..sent.len() {
             assert_eq!(command(&sent[..cut]), None, "{cut}");
         }
-        // A CAN FD frame's length, and an identifier of more than 11 bits without the flag.
-        let fd = [&[0xF1, 0, 0x23, 1, 0, 0, 0, 12][..], &[0; 13]].concat();
-        assert_eq!(command(&fd), Some((Command::NoFrame { bus: 0 }, fd.len())));
+        // A length that CAN FD has, by both commands; one that none has; an identifier of more than 11 bits without the flag.
+        let fd = |kind: u8, len: u8| {
+            [&[0xF1, kind, 0x23, 1, 0, 0, 0, len][..], &[0xA5; 64][..usize::from(len)], &[0]].concat()
+        };
+        for (kind, len) in [(0, 12), (0, 64), (20, 64), (20, 8), (20, 0)] {
+            let bytes = fd(kind, len);
+            let Some((Command::Fd { bus: 0, frame }, used)) = command(&bytes) else {
+                panic!("{:?}", command(&bytes))
+            };
+            assert_eq!(
+                (frame.to_string(), used),
+                (format!("123##1{}", "A5".repeat(len.into())), bytes.len())
+            );
+        }
+        for (kind, len) in [(0, 9), (20, 63)] {
+            assert_eq!(command(&fd(kind, len)), Some((Command::NoFrame { bus: 0 }, 9 + usize::from(len))));
+        }
         assert_eq!(command(&[0xF1, 0, 0, 8, 0, 0, 0, 0, 0]), Some((Command::NoFrame { bus: 0 }, 9)));
         for other in ["GET / HTTP/1.1", "\u{16}\u{3}\u{1}", "< open can0 >"] {
             assert_eq!(command(other.as_bytes()), Some((Command::Garbage, 1)), "{other}");

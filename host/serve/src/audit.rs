@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
 use serde_json::{Value, json};
 
@@ -21,8 +21,33 @@ const MOST_WAITING: usize = 4096;
 /// How often a failing file is tried again while nothing happens.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
 
+/// By how much the time of day may run away from the time that has passed before it counts as set, and that as a share of the time.
+const STEP: Duration = Duration::from_secs(2);
+const DRIFT: f64 = 1e-3;
+
+/// The time of day as it was last looked at: whoever sets the clock would change the order of what is recorded unseen.
+struct Clock {
+    at: Instant,
+    utc: SystemTime,
+}
+
+impl Clock {
+    /// Takes the present time, and returns by how many seconds the clock was set since the last one, if it was.
+    fn set_by(&mut self, at: Instant, utc: SystemTime) -> Option<f64> {
+        let passed = at.saturating_duration_since(self.at).as_secs_f64();
+        let shown = match utc.duration_since(self.utc) {
+            Ok(later) => later.as_secs_f64(),
+            Err(earlier) => -earlier.duration().as_secs_f64(),
+        };
+        *self = Self { at, utc };
+        let by = shown - passed;
+        (by.abs() > STEP.as_secs_f64() + passed * DRIFT).then_some(by)
+    }
+}
+
 /// Writes to a file until it is dropped.
 pub struct Audit {
+    clock: Mutex<Clock>,
     lines: Mutex<Option<SyncSender<String>>>,
     /// Lines for which there was no room.
     missing: Arc<AtomicU64>,
@@ -40,11 +65,19 @@ impl Audit {
         let counted = Arc::clone(&missing);
         let body = move || log.run(&waiting, &counted);
         let thread = std::thread::Builder::new().name("cantap-audit".to_owned()).spawn(body)?;
-        Ok(Self { lines: Mutex::new(Some(lines)), missing, thread: Mutex::new(Some(thread)) })
+        let clock = Mutex::new(Clock { at: Instant::now(), utc: SystemTime::now() });
+        Ok(Self { clock, lines: Mutex::new(Some(lines)), missing, thread: Mutex::new(Some(thread)) })
     }
 
-    /// Adds what has happened: an object's members, to which the time is added. Never waits.
-    pub fn note(&self, mut event: Value) {
+    /// Adds what has happened: an object's members, to which the time is added, and before it that the clock was set. Never waits.
+    pub fn note(&self, event: Value) {
+        if let Some(by_s) = lock(&self.clock).set_by(Instant::now(), SystemTime::now()) {
+            self.add(json!({ "event": "clock_set", "by_s": (by_s * 1e3).round() / 1e3 }));
+        }
+        self.add(event);
+    }
+
+    fn add(&self, mut event: Value) {
         event["time"] = json!(now());
         let taken =
             lock(&self.lines).as_ref().is_some_and(|lines| lines.try_send(format!("{event}\n")).is_ok());
@@ -233,6 +266,20 @@ mod tests {
         let told: Vec<String> = told.try_iter().collect();
         assert!(told.len() == 2 && told[0].contains("cannot be written to"), "{told:?}");
         assert!(told[1].contains("3 lines are missing"), "{told:?}");
+    }
+
+    #[test]
+    fn a_clock_that_is_set_is_noticed_and_one_that_drifts_is_not() {
+        let (at, utc) = (Instant::now(), SystemTime::now());
+        let mut clock = Clock { at, utc };
+        let later = |s: u64| at + Duration::from_secs(s);
+        let day = Duration::from_hours(24);
+        assert_eq!(clock.set_by(later(1), utc + Duration::from_secs(2)), None);
+        assert_eq!(clock.set_by(later(2), utc - Duration::from_secs(3597)), Some(-3600.0));
+        assert_eq!(clock.set_by(later(3), utc - Duration::from_secs(3596)), None);
+        assert_eq!(clock.set_by(later(4), utc + Duration::from_secs(5)), Some(3600.0));
+        let drifted = utc + Duration::from_secs(5) + day + Duration::from_secs(43);
+        assert_eq!(clock.set_by(later(4) + day, drifted), None, "500 ppm");
     }
 
     /// A name with a line end in it stays within its line.

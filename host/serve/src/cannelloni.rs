@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item};
+use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item, receive};
 use cantap_wire::Channel;
 use cantap_wire::message::{Mode, Role};
 
@@ -58,7 +58,7 @@ pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
     let socket = UdpSocket::bind(local)?;
     socket.connect(peer)?;
     socket.set_read_timeout(Some(SOCKET_TIMEOUT))?;
-    let local = socket.local_addr()?;
+    let (local, peer) = (socket.local_addr()?, socket.peer_addr()?);
     let name = format!("cannelloni peer {peer}");
     let role = if is_local { role } else { Role::Listen };
     let mut end = End {
@@ -70,6 +70,7 @@ pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
         }),
         board,
         channel,
+        peer,
         name,
         role,
         session: None,
@@ -95,6 +96,7 @@ struct End {
     far: Arc<Far>,
     board: Arc<Board>,
     channel: Channel,
+    peer: SocketAddr,
     name: String,
     role: Role,
     session: Option<Session>,
@@ -143,8 +145,9 @@ impl End {
                 }
             }
         }
-        match self.far.socket.recv(&mut self.buffer) {
-            Ok(len) => self.take(len),
+        match receive(&self.far.socket, self.peer, &mut self.buffer) {
+            Ok(Some(len)) => self.take(len),
+            Ok(None) => {}
             Err(error) if is_idle(&error) => {}
             // Nobody listens at the other end yet.
             Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {

@@ -11,10 +11,10 @@ use std::thread::JoinHandle;
 use std::time::Instant;
 
 use cantap::device::{channel_number, is_idle, write_patiently};
-use cantap::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
+use cantap::{Device, DeviceError, Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_codecs::gvret::{Bus, Command, Message, command};
 use cantap_wire::message::{ChannelConfig, Mode, Role};
-use cantap_wire::{CHANNELS, Channel, Frame, Refusal};
+use cantap_wire::{CHANNELS, Channel, Refusal};
 
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
@@ -177,14 +177,20 @@ impl Connection {
                 return Ok(());
             }
             Command::Frame { bus, frame } => {
-                if let Err(reason) = self.send(session, bus.into(), frame) {
+                if let Err(reason) = self.send(session, bus.into(), frame.into()) {
+                    self.not_done(reason);
+                }
+                return Ok(());
+            }
+            Command::Fd { bus, frame } => {
+                if let Err(reason) = self.send(session, bus.into(), frame.into()) {
                     self.not_done(reason);
                 }
                 return Ok(());
             }
             Command::NoFrame { .. } => {
                 self.not_done(
-                    "it sent a frame that is none: more than 8 bytes, or an identifier that is too large"
+                    "it sent a frame that is none: a length that no frame has, or an identifier that is too large"
                         .to_owned(),
                 );
                 return Ok(());
@@ -296,9 +302,12 @@ impl Connection {
         Ok(())
     }
 
-    fn send(&self, session: &mut Session, number: usize, frame: Frame) -> Result<(), String> {
+    fn send(&self, session: &mut Session, number: usize, frame: TraceFrame) -> Result<(), String> {
         let none = || format!("bus {number} is not open");
         let bus = session.buses.get_mut(number).and_then(Option::as_mut).ok_or_else(none)?;
+        if frame.classic().is_none() && !bus.device.hello().sends_fd() {
+            return Err("it sent a CAN FD frame, which the board cannot send".to_owned());
+        }
         bus.may_send(|| self.missed())?;
         let tag = bus.next_tag();
         lock(&self.own[number]).sends(tag, frame);
@@ -327,13 +336,13 @@ impl Connection {
         let number = usize::from(channel_number(board, channel)) - 1;
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
+                if *direction == Direction::Tx && lock(&self.own[number]).take(*frame) {
+                    return;
+                }
                 // SavvyCAN would take the bytes of such a message one place too late, and 64 of them for none.
                 let Some(frame) = frame.classic() else {
                     return lock(&self.left_out).count("CAN FD frames", 1);
                 };
-                if *direction == Direction::Tx && lock(&self.own[number]).take(*frame) {
-                    return;
-                }
                 if frame.is_remote() {
                     return lock(&self.left_out).count("remote frames", 1);
                 }

@@ -14,6 +14,9 @@ const SYSTEM_NAME: &str = "canlib32.dll";
 #[cfg(not(windows))]
 const SYSTEM_NAME: &str = "libcanlib.so";
 
+#[cfg(target_os = "macos")]
+const ADVICE: &str = "kvaser.com has no drivers for macOS; use the adapter on Windows or Linux";
+#[cfg(not(target_os = "macos"))]
 const ADVICE: &str = "install Kvaser's drivers from kvaser.com";
 
 /// Letters of the longest text.

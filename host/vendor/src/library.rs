@@ -57,15 +57,15 @@ pub(crate) struct Loaded {
 impl Loaded {
     /// Loads the library at a path, or the one that the system has under a name.
     pub fn load(path: Option<&Path>, system_name: &str, advice: &'static str) -> Result<Self, LoadError> {
-        let name = match path {
+        let loaded = match path {
             // A relative one would depend on where the program was started.
             Some(path) if !path.is_absolute() => {
                 return Err(LoadError::RelativePath(path.display().to_string()));
             }
-            Some(path) => path.display().to_string(),
-            None => system_name.to_owned(),
+            Some(path) => load(path.as_os_str()),
+            None => from_system(system_name),
         };
-        let loaded = path.map_or_else(|| from_system(system_name), |path| load(path.as_os_str()));
+        let name = path.map_or_else(|| in_system(system_name), |path| path.display().to_string());
         match loaded {
             Ok(library) => Ok(Self { library, name, advice }),
             Err(error) => Err(LoadError::NotInstalled { name, reason: reason(&error), advice }),
@@ -92,6 +92,14 @@ fn reason(error: &libloading::Error) -> String {
     std::error::Error::source(error).map_or_else(|| error.to_string(), ToString::to_string)
 }
 
+/// A library, with further ones that it needs from beside it and from the system.
+#[cfg(windows)]
+fn load(path: &std::ffi::OsStr) -> Result<Library, libloading::Error> {
+    use libloading::os::windows::{LOAD_LIBRARY_SEARCH_DLL_LOAD_DIR, LOAD_LIBRARY_SEARCH_SYSTEM32};
+    with_flags(path, LOAD_LIBRARY_SEARCH_DLL_LOAD_DIR | LOAD_LIBRARY_SEARCH_SYSTEM32)
+}
+
+#[cfg(not(windows))]
 fn load(name: &std::ffi::OsStr) -> Result<Library, libloading::Error> {
     // SAFETY: what a maker's library does when it is loaded is the maker's; the user has installed it, or named it.
     unsafe { Library::new(name) }
@@ -100,15 +108,31 @@ fn load(name: &std::ffi::OsStr) -> Result<Library, libloading::Error> {
 /// Not from the folder in which the program was started, where anybody may have put one: only from where installers put it.
 #[cfg(windows)]
 fn from_system(name: &str) -> Result<Library, libloading::Error> {
-    use libloading::os::windows::{LOAD_LIBRARY_SEARCH_SYSTEM32, Library as Windows};
-    // SAFETY: as above.
-    unsafe { Windows::load_with_flags(name, LOAD_LIBRARY_SEARCH_SYSTEM32) }.map(Library::from)
+    with_flags(name.as_ref(), libloading::os::windows::LOAD_LIBRARY_SEARCH_SYSTEM32)
+}
+
+#[cfg(windows)]
+fn with_flags(name: &std::ffi::OsStr, flags: u32) -> Result<Library, libloading::Error> {
+    use libloading::os::windows::Library as Windows;
+    // SAFETY: what a maker's library does when it is loaded is the maker's; the user has installed it, or named it.
+    unsafe { Windows::load_with_flags(name, flags) }.map(Library::from)
+}
+
+/// From where installers put it. By its name alone, macOS would look in the current folder first (`dlopen(3)`).
+#[cfg(target_os = "macos")]
+fn from_system(name: &str) -> Result<Library, libloading::Error> {
+    load(in_system(name).as_ref())
 }
 
 /// From the folders of the system's loader, among which the current one is not.
-#[cfg(not(windows))]
+#[cfg(not(any(windows, target_os = "macos")))]
 fn from_system(name: &str) -> Result<Library, libloading::Error> {
     load(name.as_ref())
+}
+
+/// What the system's library of a name is asked for as.
+fn in_system(name: &str) -> String {
+    if cfg!(target_os = "macos") { format!("/usr/local/lib/{name}") } else { name.to_owned() }
 }
 
 /// The text in a buffer that a library has filled, up to its first NUL. It is from outside: who shows it cleans it.

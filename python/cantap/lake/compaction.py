@@ -73,16 +73,16 @@ def _small(store: Store, file_bytes: int, done: Compacted) -> dict[str, list[_Fi
     for entry in store.entries():
         for files in entry["files"].values():
             for name, rows in files.items():
-                path = store.folder / name
                 if name in seen:
                     continue
                 seen.add(name)
                 try:
+                    path = store.path(name)
                     if path.stat().st_size * 2 >= file_bytes:
                         continue
                     own = tuple(members(path)) if is_joined(name) else ((entry["sha256"], name, rows),)
                     first_ns = _first_ns(path)
-                except (OSError, pa.ArrowInvalid) as error:
+                except (OSError, pa.ArrowInvalid, StoreError) as error:
                     done.problems.append(f"{name}: {error}")
                     continue
                 found.setdefault(name.rpartition("/")[0], []).append(_File(name, path.stat().st_size, first_ns, own))
@@ -113,8 +113,8 @@ def _filled(files: list[_File], file_bytes: int) -> Iterator[list[_File]]:
 def _join(store: Store, group: list[_File], name: str, done: Compacted) -> bool:
     """Whether the files could be joined."""
     try:
-        join([store.folder / file.name for file in group], [member for file in group for member in file.members], store.folder / name)
-    except (OSError, pa.ArrowInvalid) as error:
+        join([store.path(file.name) for file in group], [member for file in group for member in file.members], store.path(name))
+    except (OSError, pa.ArrowInvalid, StoreError) as error:
         # One may be gone because its trace has got other rows meanwhile.
         if _are_named(store, group):
             done.problems.append(f"{name}: {error}")
@@ -134,7 +134,7 @@ def _commit(store: Store, groups: list[tuple[list[_File], str]], done: Compacted
                         moved[name] = moved.get(name, 0) + rows
                 done.files += len(group)
                 done.joined += 1
-                done.bytes += (store.folder / name).stat().st_size
+                done.bytes += store.path(name).stat().st_size
         if moves:
             store.move(moves)
 

@@ -62,8 +62,18 @@ class Store:
             raise StoreError(f"{self.folder} is no lake: it has no lake.json") from None
         except (ValueError, KeyError, TypeError):
             raise StoreError(f"{self.folder / 'lake.json'} is damaged") from None
+        for name in ("ledger", _STAGING, *TABLES):
+            if (self.folder / name).is_symlink():
+                raise StoreError(f"{self.folder / name} is a link: a lake's folders are its own")
         if found not in (FORMAT, FORMAT_JOINED):
             raise StoreError(f"{self.folder} is a lake of format {found}, and this version knows up to {FORMAT_JOINED}; update cantap")
+
+    def path(self, name: str) -> Path:
+        """Where a file is. A lake of somebody else may have links in it, and files that they lead to are not the lake's."""
+        path = self.folder / name
+        if path.is_symlink() or path.parent.resolve() != (self.folder.resolve() / name).parent:
+            raise StoreError(f"{path} is, or is behind, a link: what it leads to is not read, replaced or removed")
+        return path
 
     @property
     def _ledger(self) -> Path:
@@ -118,7 +128,7 @@ class Store:
                 self._write_entry(entry)
         for name in {name for of_entry in last["moves"].values() for name in of_entry}:
             with suppress(FileNotFoundError):
-                os.utime(self.folder / name)
+                os.utime(self.path(name))
         self.transactions.end(last)
 
     def staging(self) -> Path:
@@ -129,7 +139,7 @@ class Store:
     def put(self, entry: dict[str, Any], staged: Path) -> None:
         """Takes a trace's files from a folder, and then its entry, which makes them visible."""
         for name in _files_of(entry):
-            path = self.folder / name
+            path = self.path(name)
             path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(staged / name, path)
         self.commit(entry)
@@ -145,7 +155,7 @@ class Store:
                 before = self.entry(entry["sha256"])
             self._write_entry(entry)
             for name in _files_of(before) - _files_of(entry):
-                (self.folder / name).unlink(missing_ok=True)
+                self.path(name).unlink(missing_ok=True)
 
     def add_names(self, sha256: str, names: set[str]) -> None:
         """A trace's content has come under these names, too."""
@@ -163,11 +173,11 @@ class Store:
         moves: dict[str, dict[str, dict[str, int]]] = {}
         for name in names:
             first_row = 0
-            for sha256, own, rows in members(self.folder / name):
+            for sha256, own, rows in members(self.path(name)):
                 if name in _files_of(self.entry(sha256)):
                     # It may not have been removed yet.
-                    if _rows(self.folder / own) != rows:
-                        part_of(self.folder / name, first_row, rows, self.folder / own)
+                    if _rows(self.path(own)) != rows:
+                        part_of(self.path(name), first_row, rows, self.path(own))
                     moves.setdefault(sha256, {}).setdefault(name, {})[own] = rows
                 first_row += rows
         self.move(moves)
@@ -180,7 +190,7 @@ class Store:
 
     def _mend(self) -> None:
         said = [(name, rows) for table in TABLES for name, rows in self.files(table).items() if is_joined(name)]
-        unlike = [name for name, rows in said if _rows(self.folder / name) not in (None, rows)]
+        unlike = [name for name, rows in said if _rows(self.path(name)) not in (None, rows)]
         if unlike:
             self._divide(unlike)
 
@@ -204,7 +214,7 @@ class Store:
         """A table, `frames` or `signals`, of the traces in the ledger and nothing else."""
         if table not in TABLES:
             raise StoreError(f"a lake has no table '{table}'; it has {', '.join(TABLES)}")
-        names = [str(self.folder / name) for name in self._files_as_said(table)]
+        names = [str(self.path(name)) for name in self._files_as_said(table)]
         return pyarrow.dataset.dataset(names, schema=columns.schema(TABLES[table]), format="parquet")
 
     def files(self, table: str) -> dict[str, int]:
@@ -219,7 +229,7 @@ class Store:
         """The same; raises if a joined file has rows of traces that the ledger does not know."""
         found = self.files(table)
         for name, rows in found.items():
-            if is_joined(name) and _rows(self.folder / name) != rows:
+            if is_joined(name) and _rows(self.path(name)) != rows:
                 raise StoreError(f"{name} is not as the ledger says; `cantap-lake compact` mends it if entries were removed, `check --forget` if it is damaged")
         return found
 
@@ -235,8 +245,8 @@ class Store:
         schema = deltalake.Schema.from_arrow(columns.schema(TABLES[table]))
         actions: list[Any] = []
         for name, rows in self._files_as_said(table).items():
-            about = (self.folder / name).stat()
-            path = (self.folder / name).relative_to(folder).as_posix()
+            about = self.path(name).stat()
+            path = self.path(name).relative_to(folder).as_posix()
             actions.append(AddAction(path, about.st_size, {}, int(about.st_mtime * 1000), True, json.dumps({"numRecords": rows})))
         if deltalake.DeltaTable.is_deltatable(str(folder)):
             delta = deltalake.DeltaTable(str(folder))
@@ -262,8 +272,8 @@ class Store:
                 others = f" and {len(traces[name]) - 1} others" if len(traces[name]) > 1 else ""
                 what = f"{name}, of {traces[name][0]}{others}"
                 try:
-                    rows = pq.read_metadata(self.folder / name).num_rows
-                except (OSError, pa.ArrowInvalid) as error:
+                    rows = pq.read_metadata(self.path(name)).num_rows
+                except (OSError, pa.ArrowInvalid, StoreError) as error:
                     yield name, f"{what}: {error}"
                     continue
                 if rows != count:

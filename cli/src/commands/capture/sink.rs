@@ -20,6 +20,8 @@ pub struct Sink {
     pub omits_data: Vec<u8>,
     /// Frames written without their data being known.
     without_data: u64,
+    /// Whoever read standard output has closed it.
+    is_closed: bool,
 }
 
 impl Sink {
@@ -32,6 +34,7 @@ impl Sink {
             trigger,
             omits_data: Vec::new(),
             without_data: 0,
+            is_closed: false,
         }
     }
 
@@ -72,6 +75,7 @@ impl Sink {
             Ok(()) => Ok(true),
             Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => {
                 self.writer = None;
+                self.is_closed = true;
                 Ok(false)
             }
             Err(error) => {
@@ -89,9 +93,9 @@ impl Sink {
         )
     }
 
-    /// Ends the file, and reports what it could not carry.
-    pub fn finish(mut self) -> anyhow::Result<()> {
-        let Some(writer) = self.writer.take() else { return Ok(()) };
+    /// Ends the file, and reports what it could not carry. Returns whether all that was written was taken, as far as can be known.
+    pub fn finish(mut self) -> anyhow::Result<bool> {
+        let Some(writer) = self.writer.take() else { return Ok(!self.is_closed) };
         match writer.finish() {
             Ok(left_out) => {
                 let path = Path::new(&self.name);
@@ -103,9 +107,9 @@ impl Sink {
                         self.without_data
                     );
                 }
-                Ok(())
+                Ok(true)
             }
-            Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+            Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => Ok(false),
             Err(error) => Err(error).with_context(|| self.failure()),
         }
     }

@@ -53,6 +53,9 @@ pub struct Summary {
     /// After a failure: the number of frames in the file.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub frames_in_file: Option<u64>,
+    /// Whoever read the records from standard output has closed it, so that no object is read there either.
+    #[serde(skip)]
+    pub is_closed: bool,
 }
 
 /// One of several devices.
@@ -116,6 +119,7 @@ impl Summary {
                 .then(|| GapSummary { count: gaps.count, seconds: rounded(gaps.time.as_secs_f64(), 3) }),
             trigger: None,
             frames_in_file: None,
+            is_closed: false,
         }
     }
 
@@ -134,6 +138,11 @@ impl Summary {
             if *forgotten > 0 {
                 eprintln!("{forgotten} records before events were too many to remember; use a shorter --pre");
             }
+        }
+        if self.is_closed {
+            eprintln!(
+                "standard output was closed before the end: how many of these frames its reader took is not known"
+            );
         }
         let frames: u64 = self.channels.iter().map(|channel| channel.frames).sum();
         if let (Some(path), Some(in_file)) =

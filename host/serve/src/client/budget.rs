@@ -4,7 +4,7 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use cantap_wire::Channel;
 use cantap_wire::message::MAX_SEND;
@@ -49,6 +49,30 @@ impl Budget {
             *left -= frames as f64;
         }
         is_enough
+    }
+
+    /// How long a periodic entry has to stop before one with this rate is set in its place, if it leaves nothing for the first frame of that: in
+    /// this time its share pays for the frame. `None` if there is no such entry, if enough comes while it goes on, if it takes longer than
+    /// `within`, or if the rate does not fit.
+    pub fn pause_for(
+        &mut self,
+        (holder, channel, slot): (Holder, Channel, u8),
+        rate: f64,
+        per_second: u32,
+        now: Instant,
+        within: Duration,
+    ) -> Option<Duration> {
+        let left = self.settle(per_second, now);
+        let key = (holder, channel.index(), slot);
+        let share = *self.periodic.get(&key)?;
+        let free = f64::from(per_second) - self.periodic.values().sum::<f64>();
+        let pause = Duration::try_from_secs_f64((1.0 - left) / share).ok()?;
+        let is_enough = left + free.max(0.0) * within.as_secs_f64() >= 1.0;
+        if is_enough || pause > within || rate > free + share {
+            return None;
+        }
+        self.left = Some((0.0, now));
+        Some(pause)
     }
 
     /// Sets the share of a periodic entry, if it fits; returns the one that it had.
@@ -98,7 +122,6 @@ impl Budget {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::time::Duration;
 
     const ONE: Holder = (0, 1);
     const TWO: Holder = (0, 2);
@@ -160,6 +183,32 @@ mod tests {
             sent += (0..1000).filter(|_| budget.take(1, 100, now)).count();
         }
         assert_eq!(sent, 0);
+    }
+
+    /// An entry that takes the whole rate stops for as long as its share takes to pay for the first frame of the next one.
+    #[test]
+    fn an_entry_that_takes_the_whole_rate_is_set_anew_after_a_pause() {
+        let (mut budget, now) = (Budget::default(), Instant::now());
+        let (of, within) = ((ONE, Channel::Can1, 0), Duration::from_millis(800));
+        while budget.take(1, 100, now) {}
+        assert_eq!(budget.pause_for(of, 100.0, 100, now, within), None, "there is none yet");
+        budget.set_periodic(of, 100.0, 100, now).unwrap();
+        assert!(!budget.take(1, 100, now + within), "nothing comes while it goes on");
+        assert_eq!(
+            budget.pause_for(of, 101.0, 100, now, within),
+            None,
+            "what would be refused stops nothing"
+        );
+        let pause = Some(Duration::from_millis(10));
+        assert_eq!(budget.pause_for(of, 100.0, 100, now, within), pause);
+        assert_eq!(budget.pause_for(of, 100.0, 100, now + Duration::from_secs(9), within), pause);
+        assert_eq!(budget.set_periodic(of, 90.0, 100, now), Ok(Some(100.0)));
+        assert_eq!(budget.pause_for(of, 100.0, 100, now, within), None, "ten frames a second are left");
+        // At one frame a second it takes too long: the entry goes on as it was.
+        let mut slow = Budget::default();
+        while slow.take(1, 1, now) {}
+        slow.set_periodic(of, 1.0, 1, now).unwrap();
+        assert_eq!(slow.pause_for(of, 1.0, 1, now, within), None);
     }
 
     #[test]

@@ -91,6 +91,22 @@ impl Client {
         Ok(())
     }
 
+    /// Takes the first frame of a periodic entry out of the budget. Returns whether the one that it replaces was stopped for that, because it
+    /// leaves nothing.
+    fn take_first_of_entry(&self, channel: Channel, slot: u8, rate: f64) -> Result<bool, Refusal> {
+        let deadline = Instant::now() + ROOM_TIMEOUT;
+        let Some(most) = self.frames_per_second() else { return Ok(false) };
+        let found = self.shared.state().entries[channel.index()].find(Table::Periodic, self.id, slot);
+        let of = (self.holder(), channel, slot);
+        let pause = || lock(&self.budget).pause_for(of, rate, most, Instant::now(), ROOM_TIMEOUT);
+        if let Some((found, pause)) = found.and_then(|found| Some((found, pause()?))) {
+            self.shared.ask(clears(Table::Periodic, channel, found), Then::Nothing)?;
+            std::thread::sleep(pause);
+            return Ok(true);
+        }
+        self.take_from_budget(1, deadline).map(|()| false)
+    }
+
     /// The client, as its certificate's budget knows it.
     fn holder(&self) -> Holder {
         (self.permit.as_ref().map_or(0, |(_, number)| *number), self.id)
@@ -166,14 +182,14 @@ impl Client {
         entry: Option<Periodic>,
     ) -> Result<Reply, Refusal> {
         let tick_hz = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.tick_hz));
-        let mut had = None;
+        let (mut had, mut has_stopped) = (None, false);
         if let Some(entry) = &entry {
             // The first frame leaves at once, however long the period is.
             self.may_transmit_on(channel)?;
-            self.take_from_budget(1, Instant::now() + ROOM_TIMEOUT)?;
             let rate = f64::from(tick_hz) / f64::from(entry.period_ticks.max(1));
+            self.must_be_permitted(Role::Send, |permit, _| permit.send(entry.frame.id()))?;
+            has_stopped = self.take_first_of_entry(channel, slot, rate)?;
             self.must_be_permitted(Role::Send, |permit, _| {
-                permit.send(entry.frame.id())?;
                 let Some(most) = permit.frames_per_second else { return Ok(()) };
                 let (of, now) = ((self.holder(), channel, slot), Instant::now());
                 had =
@@ -192,7 +208,8 @@ impl Client {
         if result.is_err() != is_cleared
             && let Some(most) = self.frames_per_second()
         {
-            // What was refused has changed nothing: an entry that was there goes on.
+            // What was refused has changed nothing: an entry that was there goes on, unless it was stopped.
+            let had = had.filter(|_| !has_stopped);
             lock(&self.budget).has_periodic((self.holder(), channel, slot), had, most, Instant::now());
         }
         if result.is_ok() {

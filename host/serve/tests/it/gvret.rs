@@ -160,8 +160,10 @@ fn sending_takes_the_right_to_and_the_sender_does_not_hear_itself() {
     assert_eq!(seen, Some((2, "123#AABB".to_owned())));
     assert_eq!(program.ask(Command::KeepAlive), Message::Alive);
     // What is no frame is not sent, and what comes behind it is read.
+    program.write(&[&[0xF1, 0, 0x23, 1, 0, 0, 0, 9][..], &[0; 10]].concat());
+    tells(&told, "a length that no frame has");
     program.write(&[&[0xF1, 0, 0x23, 1, 0, 0, 0, 12][..], &[0; 13]].concat());
-    tells(&told, "more than 8 bytes");
+    tells(&told, "a CAN FD frame, which the board cannot send");
     program.write(&[0xF1, 0, 0x23, 1, 0, 0, 3, 0, 0]);
     tells(&told, "bus 3 is not open");
     assert_eq!(program.ask(Command::KeepAlive), Message::Alive);

@@ -176,6 +176,33 @@ fn so_many_frames_per_second_of_a_certificate_and_no_more() {
     }
 }
 
+/// Such as a cyclic frame whose data change: no more leaves than the rate, and no client has to clear it first.
+#[test]
+fn an_entry_that_takes_its_certificate_s_whole_rate_is_replaced() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve_at(folder.path(), Settings { dead_man: None, ..Settings::at(BITRATE_BPS) });
+    served.permit("[clients.alice]\nframes_per_second = 50");
+    let alice = Keys::in_folder(folder.path()).unwrap().add_client("alice", Role::Send).unwrap();
+    let device = served.connect(&alice).unwrap();
+    device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
+    let tick_hz = device.hello().tick_hz;
+    let with = |text: &str| Periodic {
+        frame: text.parse().unwrap(),
+        period_ticks: tick_hz / 50,
+        count: 0,
+        modifiers: [].into_iter().collect(),
+    };
+    for data in 0..20 {
+        device.set_periodic(Channel::Can1, 0, Some(with(&format!("123#{data:02X}")))).unwrap();
+    }
+    is_refused(&device.set_periodic(Channel::Can1, 1, Some(with("123#"))), "a second one");
+    // By the device's stamps: none came earlier than the rate allows, over all of the replacements.
+    let is_own = |record: &cantap::TraceRecord| record.frame().is_some_and(|frame| frame.data_len() == 1);
+    let records = device.records().map_while(Result::ok).filter(is_own);
+    let times: Vec<i64> = records.take(40).map(|record| record.time_ns).collect();
+    assert!(times.len() == 40 && times[39] - times[0] >= 39 * 20_000_000 - 20_000_000, "{times:?}");
+}
+
 /// Configuring reaches further than listening: what is stored, a measurement and a restart concern channels that need not be open.
 #[test]
 fn who_has_one_channel_configures_no_other() {

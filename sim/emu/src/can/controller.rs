@@ -313,8 +313,9 @@ impl Controller {
     fn msr(&self) -> u32 {
         let mode = match self.mode {
             Mode::Sleep => msr::SLAK,
-            // The acknowledgement stays until the controller has synchronised.
-            Mode::Initialisation | Mode::Synchronising { .. } if self.mcr & mcr::SLEEP == 0 => msr::INAK,
+            // The acknowledgement stays until the controller has synchronised. SLEEP, still set, does not withhold it: candleLight's driver
+            // (src/can/bxcan.c) requests initialisation right after a reset, and boards run with it.
+            Mode::Initialisation | Mode::Synchronising { .. } => msr::INAK,
             _ => 0,
         };
         mode | self.msr_flags

@@ -32,8 +32,8 @@ use crate::places::{Places, ends};
 use crate::{Board, News, small_file};
 
 pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};
-pub use visitors::{Sessions, Stream, Visitor, visitors};
 use stream::{Secured, shake_hands};
+pub use visitors::{Sessions, Stream, Visitor, visitors};
 
 /// A peer that has not shown its certificate by this time is dropped.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);

@@ -99,7 +99,10 @@ fn introduce(
     let mut first = [0; foreign::ENOUGH];
     let len = stream.peek(&mut first).map_err(bad)?;
     if let Some(protocol) = foreign::protocol(&first[..len]).filter(|protocol| *protocol != "TLS") {
-        return Err((stranger(), format!("it speaks {protocol}, without encryption: the address begins with https://")));
+        return Err((
+            stranger(),
+            format!("it speaks {protocol}, without encryption: the address begins with https://"),
+        ));
     }
     let mut config = (*server.trust().config).clone();
     config.alpn_protocols = vec![INSIDE.to_vec()];

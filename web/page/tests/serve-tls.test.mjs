@@ -13,7 +13,7 @@ after(quit);
 const PERMISSIONS = `
 [clients.alice]
 channels = [1]
-send = ["123"]
+send = ["7F0"]
 [clients.bob]
 role = "listen"
 [clients.dave]
@@ -31,7 +31,7 @@ const pageOf = (server, name) => newPage({ url: server.url, more: { ignoreHTTPSE
 const ask = (server, path, { key = {}, headers = {}, ...more } = {}) =>
   new Promise((done) => {
     const { hostname, port } = new URL(server.url);
-    const asked = request({ hostname, port, path, headers, ca: server.ca, agent: false, ...key, ...more }, (answer) => {
+    const asked = request({ hostname, port, path, headers, ca: server.ca, servername: 'localhost', agent: false, ...key, ...more }, (answer) => {
       answer.resume().on('error', () => {});
       answer.on('close', () => done({ status: answer.statusCode, headers: answer.headers }));
     });
@@ -63,10 +63,10 @@ test('each certificate sees and sends what it may, and no more', async () => {
     await alice.getByRole('button', { name: 'Take part …' }).click();
     await alice.getByRole('button', { name: 'Take part', exact: true }).click();
     await untilText(alice, '#live-mode', 'take part');
-    await alice.locator('#send-frame').fill('123#C0FFEE');
+    await alice.locator('#send-frame').fill('7F0#C0FFEE');
     await alice.getByRole('button', { name: 'Send once' }).click();
     await show(bob, 'fixed');
-    await until(bob, 'the frame is there', () => document.querySelector('#view-fixed').textContent.includes('C0 FF EE'));
+    await until(bob, 'the frame is there', () => document.querySelector('#view-fixed').textContent.includes('7F0'));
     await alice.locator('#send-frame').fill('7FF#C0FFEE');
     await alice.getByRole('button', { name: 'Send once' }).click();
     await until(alice, 'it is refused', () => /not permitted|refuse/i.test(document.body.textContent));

@@ -31,7 +31,7 @@ test('from a disk: files are dropped onto it, and all views show them', { skip }
     const dropped = new DataTransfer();
     dropped.items.add(new File([log], 'drive.log'));
     dropped.items.add(new File([dbc], 'car.dbc'));
-    for (const type of ['dragover', 'drop']) document.body.dispatchEvent(new DragEvent(type, { dataTransfer: dropped, bubbles: true, cancelable: true }));
+    for (const type of ['dragover', 'drop']) document.querySelector('main.start').dispatchEvent(new DragEvent(type, { dataTransfer: dropped, bubbles: true, cancelable: true }));
   }, [`${LINES}\n`, DBC]);
   await page.locator('.shell[data-growing=false]').waitFor();
   await untilText(page, '#view-summary', 'car.dbc');

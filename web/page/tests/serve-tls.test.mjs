@@ -39,7 +39,7 @@ const ask = (server, path, { key = {}, headers = {}, ...more } = {}) =>
       socket.destroy();
       done({ status: answer.statusCode });
     });
-    asked.on('error', (error) => done({ error: error.code ?? error.message }));
+    asked.on('error', (error) => done({ error: `${error.code} ${error.message}` }));
     asked.end();
   });
 
@@ -110,7 +110,7 @@ test('without a certificate, with a foreign one, another name or another page, t
     assert.equal((await ask(server, '/trace', { key })).status, 404);
     assert.equal((await ask(server, '/', { key, method: 'POST' })).status, 405);
     // Another protocol inside than ours.
-    assert.match((await ask(server, '/', { key, ALPNProtocols: ['h2'] })).error, /NO_APPLICATION_PROTOCOL|ECONNRESET/);
+    assert.match((await ask(server, '/', { key, ALPNProtocols: ['h2'] })).error, /no application protocol/i);
     // No older version.
     assert.ok((await ask(server, '/', { key, maxVersion: 'TLSv1.2' })).error);
     // HTTP without encryption: not a word.

@@ -40,7 +40,7 @@ pub struct Visitor {
 
 /// A visitor's connection.
 pub struct Stream {
-    stream: TcpStream,
+    socket: TcpStream,
     reader: Reader,
     writer: Writer,
 }
@@ -123,7 +123,7 @@ fn introduce(
     if let Ok(Some(permit)) = visitor.boards[0].permit_of(visitor.certificate_name()) {
         visitor.role = permit.role(role);
     }
-    Ok((visitor, Stream { stream: raw, reader, writer }))
+    Ok((visitor, Stream { socket: raw, reader, writer }))
 }
 
 impl Visitor {
@@ -227,7 +227,7 @@ impl Stream {
     /// After this time, a read that got nothing ends with [`WouldBlock`](io::ErrorKind::WouldBlock) or
     /// [`TimedOut`](io::ErrorKind::TimedOut). It can do so earlier.
     pub fn set_read_timeout(&self, timeout: Duration) -> io::Result<()> {
-        self.stream.set_read_timeout(Some(timeout))
+        self.socket.set_read_timeout(Some(timeout))
     }
 }
 

@@ -87,7 +87,9 @@ impl People {
     pub fn end(&self) {
         self.0.is_over.store(true, Ordering::Relaxed);
         let rooms: Vec<Room> = std::mem::take(&mut *self.0.rooms()).into_values().collect();
-        rooms.iter().for_each(|room| room.shared.end());
+        for room in &rooms {
+            room.shared.end();
+        }
         for room in rooms {
             let _ = room.thread.join();
         }

@@ -61,6 +61,8 @@ use cantap_work::timing_options::TimingOptions;
                 cantap serve -d /dev/ttyACM0 -b 500k --web --db car.dbc\n  \
                 cantap serve keygen keys --host vehicle --client alice:send\n  \
                 cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 \\\n      \
+                --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem\n  \
+                cantap serve -d /dev/ttyACM0 -b 500k --web 192.0.2.7 \\\n      \
                 --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
 )]
 pub struct Args {
@@ -76,8 +78,8 @@ pub struct Args {
     bitrates: Vec<ChannelBitrate>,
     /// The maximum role of clients: listen (the default); configure, which allows choosing bit rates and storing settings, one client at a
     /// time for each channel; send, which includes acknowledging. With a listener before it (unix:send, tcp:send, socketcand:send, gvret:send,
-    /// cannelloni:send, web:send), only for that one. Can be repeated. The last four are asked for no name, and only listen unless they are
-    /// named.
+    /// cannelloni:send, web:send), only for that one. Can be repeated. The last four are asked for no name (web: without --tls), and only listen
+    /// unless they are named.
     #[arg(long = "allow", value_name = "ROLE", value_parser = allowed)]
     allowed: Vec<Allowed>,
     /// normal: the board acknowledges on its buses from the first listener on, so that no client that sends takes it off its bus for a
@@ -100,14 +102,14 @@ pub struct Args {
     /// require --tls.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     tcp: Option<String>,
-    /// Admit clients from other computers at --tcp, encrypted: this server's certificate and key (PEM).
+    /// Admit clients from other computers at --tcp and --web, encrypted: this server's certificate and key (PEM).
     #[cfg(feature = "tls")]
-    #[arg(long, value_name = "CERT,KEY", requires_all = ["tcp", "clients"], value_parser = keys::two_files)]
+    #[arg(long, value_name = "CERT,KEY", requires = "clients", value_parser = keys::two_files)]
     tls: Option<(PathBuf, PathBuf)>,
     /// Announce the listener at --tcp by DNS-SD to everybody on its network, so that `cantap list --network` finds it: with the board's serial number and
     /// this computer's name.
     #[cfg(feature = "tls")]
-    #[arg(long, requires = "tls")]
+    #[arg(long, requires_all = ["tls", "tcp"])]
     announce: bool,
     /// The certificate of the authority that signed the clients' certificates.
     #[cfg(feature = "tls")]
@@ -129,7 +131,7 @@ pub struct Args {
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
     /// Serve the page of cantap ui, for browsers on this computer; default 127.0.0.1:29540. Its address, which is printed, has a secret token
-    /// in it.
+    /// in it. At an address that other computers can reach, or behind https://, with --tls: for browsers that have a client's certificate.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     web: Option<String>,
     #[command(flatten)]
@@ -214,7 +216,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let (None, Some(option)) = (&args.web, args.databases.given()) {
         return Err(usage(format!("{option} is for the page; give --web, too")));
     }
-    let web = args.web.as_deref().map(|text| WebDoor::new(text, &devices, &args.databases)).transpose()?;
+    let web =
+        args.web.as_deref().map(|text| WebDoor::new(text, &way, &devices, &args.databases)).transpose()?;
+    if way.scheme() == "tls" && tcp.is_none() && !web.as_ref().is_some_and(WebDoor::is_encrypted) {
+        return Err(usage("--tls is for --tcp, or for --web at an address of the network; give one of them"));
+    }
     #[cfg(feature = "tls")]
     let permissions = args.permissions.as_deref();
     #[cfg(not(feature = "tls"))]
@@ -237,7 +243,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
-    let web = web.map(|web| web.open(&devices, &boards, allow(&args.allowed, Door::Web))).transpose()?;
+    let web = web.map(|web| web.open(&devices, &boards, &args.allowed)).transpose()?;
     let (url, page) = web.unzip();
     let (listening, encrypted) =
         listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;

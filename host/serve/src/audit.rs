@@ -176,12 +176,17 @@ impl Log {
 /// A client's name, and what it consists of: the name in its certificate, and its address.
 pub(crate) fn who(client: &str) -> Value {
     let parts = client.rsplit_once(' ').filter(|(_, address)| address.parse::<SocketAddr>().is_ok());
-    let certificate = parts.and_then(|(name, _)| name.strip_suffix(AT));
+    let certificate = match parts {
+        Some((name, _)) => name.strip_suffix(AT).map(|name| name.strip_prefix(PAGE_OF).unwrap_or(name)),
+        None => client.strip_prefix(PAGE_OF),
+    };
     json!({ "client": client, "certificate": certificate, "address": parts.map(|(_, address)| address) })
 }
 
 /// Between the name of a client's certificate and its address.
 pub(crate) const AT: &str = " at";
+/// Before the name of a certificate that is shown by a browser; certificates' names have no blanks.
+pub(crate) const PAGE_OF: &str = "page of ";
 
 /// The time as RFC 3339 has it, in UTC.
 fn now() -> String {
@@ -223,6 +228,20 @@ mod tests {
                 object["event"].as_str().unwrap().to_owned()
             })
             .collect()
+    }
+
+    #[test]
+    fn a_certificates_name_is_found_in_a_clients() {
+        for (client, certificate, address) in [
+            ("alice at 192.0.2.7:4000", json!("alice"), json!("192.0.2.7:4000")),
+            ("page of alice at 192.0.2.7:4000", json!("alice"), json!("192.0.2.7:4000")),
+            ("page of alice", json!("alice"), Value::Null),
+            ("page 192.0.2.7:4000", Value::Null, json!("192.0.2.7:4000")),
+            ("the page", Value::Null, Value::Null),
+        ] {
+            let expected = json!({ "client": client, "certificate": certificate, "address": address });
+            assert_eq!(who(client), expected);
+        }
     }
 
     #[test]

@@ -226,7 +226,8 @@ impl Board {
         self.link_of(Guest { is_counted: false, ..Guest::of_board(name, role) })
     }
 
-    fn link_of(&self, guest: Guest) -> Result<Link, Refused> {
+    /// The same for a guest.
+    pub(crate) fn link_of(&self, guest: Guest) -> Result<Link, Refused> {
         let (reader, output) = pipe(PIPE_BYTES);
         let (input, writer) = pipe(PIPE_BYTES);
         self.admit_guest(input, output, guest)?;

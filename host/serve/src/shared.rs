@@ -233,6 +233,9 @@ pub enum Refused {
     /// Its certificate's permissions do not let it in.
     #[error(transparent)]
     NotPermitted(Denied),
+    /// Its certificate is not trusted any more.
+    #[error("{0}")]
+    NotTrusted(String),
     /// The server is ending.
     #[error("the server ends")]
     Over,

@@ -78,6 +78,16 @@ pub fn is_own_host(host: &str, address: SocketAddr) -> bool {
     host == address.to_string() || host.eq_ignore_ascii_case(&format!("localhost:{port}"))
 }
 
+/// Where requests come in.
+pub struct Door<'a> {
+    /// The scheme of its address: `http` or `https`.
+    pub scheme: &'static str,
+    /// Whether a host, with its port, is this server.
+    pub is_own_host: &'a dyn Fn(&str) -> bool,
+    /// What must be shown; none where a certificate has been.
+    pub token: Option<&'a Token>,
+}
+
 /// Checks a request: its host, its origin if it has one, and its token. `of_page`: an origin is required, as browsers send it with a
 /// WebSocket.
 pub fn check(
@@ -85,21 +95,21 @@ pub fn check(
     origin: Option<&str>,
     token: Option<&str>,
     of_page: bool,
-    expected: (&Token, SocketAddr),
+    door: &Door<'_>,
 ) -> Result<(), Refusal> {
-    let (own, address) = expected;
-    let host = host.filter(|host| is_own_host(host, address)).ok_or(Refusal::Host)?;
+    let host = host.filter(|host| (door.is_own_host)(host)).ok_or(Refusal::Host)?;
     match origin {
         Some(origin) => {
-            let of = origin.strip_prefix("http://").ok_or(Refusal::Origin)?;
-            if !of.eq_ignore_ascii_case(host) {
+            let of = origin.strip_prefix(door.scheme).and_then(|rest| rest.strip_prefix("://"));
+            if !of.is_some_and(|of| of.eq_ignore_ascii_case(host)) {
                 return Err(Refusal::Origin);
             }
         }
         None if of_page => return Err(Refusal::Origin),
         None => {}
     }
-    if token.is_some_and(|token| own.is(token)) { Ok(()) } else { Err(Refusal::Token) }
+    let is_known = door.token.is_none_or(|own| token.is_some_and(|token| own.is(token)));
+    if is_known { Ok(()) } else { Err(Refusal::Token) }
 }
 
 #[cfg(test)]
@@ -110,7 +120,9 @@ mod tests {
     fn only_the_own_page_with_the_token_gets_in() {
         let token = Token("0123456789abcdef0123456789abcdef".to_owned());
         let address: SocketAddr = "127.0.0.1:4711".parse().unwrap();
-        let ask = |host, origin, given, of_page| check(host, origin, given, of_page, (&token, address));
+        let door =
+            Door { scheme: "http", is_own_host: &|host| is_own_host(host, address), token: Some(&token) };
+        let ask = |host, origin, given, of_page| check(host, origin, given, of_page, &door);
         let own = Some("127.0.0.1:4711");
         let given = Some(token.text());
         assert_eq!(ask(own, None, given, false), Ok(()));
@@ -149,6 +161,27 @@ mod tests {
             Some("0123456789ABCDEF0123456789ABCDEF"),
         ] {
             assert_eq!(ask(own, None, other, false), Err(Refusal::Token), "{other:?}");
+        }
+    }
+
+    /// A certificate has been shown, so there is no token; whose page asks matters all the more, because browsers show it for every page.
+    #[test]
+    fn over_tls_only_the_own_page_gets_in() {
+        let door = Door { scheme: "https", is_own_host: &|host| host == "vehicle:4711", token: None };
+        let ask = |host, origin, of_page| check(Some(host), origin, None, of_page, &door);
+        assert_eq!(ask("vehicle:4711", None, false), Ok(()));
+        assert_eq!(ask("vehicle:4711", Some("https://vehicle:4711"), true), Ok(()));
+        assert_eq!(ask("evil.example:4711", None, false), Err(Refusal::Host));
+        assert_eq!(ask("vehicle:4711", None, true), Err(Refusal::Origin));
+        for origin in [
+            "http://vehicle:4711",
+            "https://evil.example",
+            "https://vehicle",
+            "httpsvehicle:4711",
+            "null",
+            "",
+        ] {
+            assert_eq!(ask("vehicle:4711", Some(origin), true), Err(Refusal::Origin), "{origin}");
         }
     }
 

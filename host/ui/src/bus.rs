@@ -99,12 +99,19 @@ impl Bus {
     }
 
     /// Runs until Ctrl-C or the server's end.
-    pub fn run(mut self) {
+    pub fn run(self) {
+        self.run_while(|| true);
+    }
+
+    /// The same; when no page has been there for some time, it goes on only if this says so.
+    pub fn run_while(mut self, goes_on: impl Fn() -> bool) {
         let mut recovery: Vec<_> =
             self.device.boards.addresses().iter().map(|_| self.device.open.recovery()).collect();
         let mut next_figures = Instant::now();
         while !interrupt::requested() && !self.shared.is_over() {
-            self.come_and_go();
+            if self.come_and_go() && !goes_on() {
+                break;
+            }
             self.receive();
             for _ in 0..ORDERS_AT_A_TIME {
                 let Ok(order) = self.orders.try_recv() else { break };
@@ -134,17 +141,18 @@ impl Bus {
     }
 
     /// Shared devices are listened to while pages are there, and a little longer: without any, whoever shares them with others is not kept
-    /// from anything.
-    fn come_and_go(&mut self) {
-        let Some(hosted) = &self.device.hosted else { return };
+    /// from anything. Returns whether they are at rest.
+    fn come_and_go(&mut self) -> bool {
+        let Some(hosted) = &self.device.hosted else { return false };
         let has_pages = self.shared.has_pages();
-        if self.lines.is_some() {
-            if !has_pages && self.shared.silence() >= hosted.linger {
-                self.rest();
-            }
-        } else if has_pages {
+        let is_at_rest = !has_pages && self.shared.silence() >= hosted.linger;
+        if is_at_rest && self.lines.is_some() {
+            self.rest();
+        }
+        if has_pages && self.lines.is_none() {
             self.connect_when_there();
         }
+        is_at_rest
     }
 
     fn rest(&mut self) {

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::bail;
 use cantap::Channel;
-use cantap::device::Link;
+use cantap::device::{Link, channel_number};
 use cantap::wire::message::{Mode, Role};
 use cantap_address::{Address, OpenDevice};
 use cantap_signals::Decoder;
@@ -43,6 +43,8 @@ pub struct Device {
 pub struct Hosted {
     /// Links to one, by its place from 0.
     pub link: Arc<dyn Fn(usize) -> anyhow::Result<Link> + Send + Sync>,
+    /// Whether a channel may be listened to, by its number from 1. The others are not opened.
+    pub may_use: Arc<dyn Fn(u8) -> bool + Send + Sync>,
     /// For how long they are still listened to when no page is there any more.
     pub linger: Duration,
 }
@@ -73,9 +75,13 @@ impl Device {
             };
             let (open, filters) = (self.open.on_board(board), filters_on(board, &self.filters));
             let channels: Vec<Channel> = self.boards.channels_of(board).collect();
-            let (is_hosted, reporter) = (self.hosted.is_some(), reporter.clone());
+            let (may_use, reporter) =
+                (self.hosted.as_ref().map(|hosted| Arc::clone(&hosted.may_use)), reporter.clone());
             Line::new(&address.to_string(), connect, move |device| {
-                let channels = if is_hosted { known(device, &channels)? } else { channels.clone() };
+                let channels = match &may_use {
+                    Some(may_use) => known(device, board, &channels, &**may_use)?,
+                    None => channels.clone(),
+                };
                 open.open(device, channels.into_iter(), Mode::ListenOnly, Some(&filters), &reporter)
                     .map(|_| ())
             })
@@ -84,10 +90,20 @@ impl Device {
     }
 }
 
-/// The channels of a shared device whose bit rates its owner has given.
-fn known(device: &OpenDevice, channels: &[Channel]) -> anyhow::Result<Vec<Channel>> {
+/// The channels of a shared device that may be used, and whose bit rates its owner has given.
+fn known(
+    device: &OpenDevice,
+    board: usize,
+    channels: &[Channel],
+    may_use: &dyn Fn(u8) -> bool,
+) -> anyhow::Result<Vec<Channel>> {
     let mut known = Vec::new();
-    for channel in channels {
+    let may_use: Vec<_> =
+        channels.iter().filter(|channel| may_use(channel_number(board, **channel))).collect();
+    if may_use.is_empty() {
+        bail!("the permissions name no channel of '{}' for this certificate", device.name());
+    }
+    for channel in may_use {
         if device.defaults(*channel)?.is_some() {
             known.push(*channel);
         }

@@ -1,8 +1,9 @@
 //! Requests of browsers, and the heads of answers. A connection has one request.
 
-use std::io::{self, Read, Write};
-use std::net::TcpStream;
+use std::io::{self, Write};
 use std::time::{Duration, Instant};
+
+use crate::stream::{Stream, is_idle};
 
 /// Longest head of a request.
 const MOST_BYTES: usize = 16 * 1024;
@@ -39,7 +40,7 @@ pub enum BadHead {
 
 impl Head {
     /// Reads it. Bytes after it are dropped: who asks has nothing more to say before the answer.
-    pub fn read(stream: &mut TcpStream) -> Result<Self, BadHead> {
+    pub fn read(stream: &mut dyn Stream) -> Result<Self, BadHead> {
         let deadline = Instant::now() + PATIENCE;
         let mut bytes = Vec::new();
         let mut piece = [0; 2048];
@@ -52,9 +53,10 @@ impl Head {
             }
             let left = deadline.checked_duration_since(Instant::now()).filter(|left| !left.is_zero());
             let left = left.ok_or(BadHead::Gone)?;
-            stream.set_read_timeout(Some(left)).map_err(|_| BadHead::Gone)?;
+            stream.set_read_timeout(left).map_err(|_| BadHead::Gone)?;
             match stream.read(&mut piece) {
                 Ok(len @ 1..) => bytes.extend_from_slice(&piece[..len]),
+                Err(error) if is_idle(&error) => {}
                 _ => return Err(BadHead::Gone),
             }
         }

@@ -1,7 +1,7 @@
 //! The port at which the page is served, with one thread for each connection.
 
 use std::fs::File;
-use std::io::{self, Write};
+use std::io;
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -12,22 +12,19 @@ use anyhow::Context;
 use cantap::wire::message::Role;
 use cantap_work::interrupt;
 use cantap_work::report::Reporter;
-use tungstenite::WebSocket;
-use tungstenite::handshake::derive_accept_key;
-use tungstenite::protocol;
 
-use crate::access::{self, Refusal, Token};
+use crate::access::{self, Door, Refusal, Token};
 use crate::bus::Bus;
 use crate::connections::Connections;
 use crate::device::Device;
-use crate::head::{self, BadHead, Head};
-use crate::session::{self, Session};
+use crate::entrance::{self, Connection, Live};
+use crate::head::{self, Head};
 use crate::shared::Shared;
 use crate::site::Site;
 use crate::visits::{Visit, Visitor, Visits};
 
 /// Pages at a time.
-const MOST_PAGES: usize = 8;
+pub(crate) const MOST_PAGES: usize = 8;
 /// A browser that takes nothing for this long has gone.
 const WRITE_PATIENCE: Duration = Duration::from_secs(10);
 /// How often to check for Ctrl-C where there is no device.
@@ -189,31 +186,17 @@ fn accept(listener: &TcpListener, doors: &Arc<Doors>) {
 }
 
 impl Doors {
-    fn answer(&self, mut stream: TcpStream, number: u64) -> io::Result<()> {
+    fn answer(&self, stream: TcpStream, number: u64) -> io::Result<()> {
         stream.set_nodelay(true)?;
         stream.set_write_timeout(Some(WRITE_PATIENCE))?;
         let name = format!("page {}", stream.peer_addr()?);
-        let head = match Head::read(&mut stream) {
-            Ok(head) => head,
-            Err(BadHead::Gone) => return Ok(()),
-            Err(BadHead::Malformed) => {
-                self.refused(&name, "it sends no request of a browser");
-                return head::sentence(&mut stream, "400 Bad Request", "This is no request of a browser.");
-            }
-            Err(BadHead::TooLong) => {
-                self.refused(&name, "its request is too long");
-                return head::sentence(
-                    &mut stream,
-                    "431 Request Header Fields Too Large",
-                    "The request is too long.",
-                );
-            }
-        };
+        let mut stream: Connection = Box::new(stream);
+        let Some(head) = entrance::request(&mut stream, &name, &self.visits)? else { return Ok(()) };
         let is_live = head.path == "/live";
         let (host, origin) = (head.header("host"), head.header("origin"));
-        if let Err(refusal) =
-            access::check(host, origin, head.parameter("token"), is_live, (&self.token, self.address))
-        {
+        let is_own_host = |host: &str| access::is_own_host(host, self.address);
+        let door = Door { scheme: "http", is_own_host: &is_own_host, token: Some(&self.token) };
+        if let Err(refusal) = access::check(host, origin, head.parameter("token"), is_live, &door) {
             // Browsers ask for it by themselves, and without a token.
             let is_icon = refusal == Refusal::Token && head.path == "/favicon.ico";
             if !is_icon {
@@ -227,23 +210,14 @@ impl Doors {
             return head::sentence(&mut stream, "405 Method Not Allowed", "This server answers GET alone.");
         }
         match (head.path.as_str(), &self.live, &self.trace) {
-            ("/", ..) => self.page(&mut stream, host.unwrap_or_default()),
+            ("/", ..) => {
+                let policy = self.site.policy(host.unwrap_or_default(), false);
+                entrance::page(&mut stream, &self.site, &policy)
+            }
             ("/live", Some((shared, run)), _) => self.upgrade(stream, &head, shared, run.text(), &name),
             ("/trace", _, Some(path)) => trace(&mut stream, path),
             _ => head::sentence(&mut stream, "404 Not Found", "There is nothing here; the page is at /."),
         }
-    }
-
-    fn page(&self, stream: &mut TcpStream, host: &str) -> io::Result<()> {
-        let page = self.site.page().as_bytes();
-        head::answer(
-            stream,
-            "200 OK",
-            "text/html; charset=utf-8",
-            page.len() as u64,
-            &self.site.policy(host),
-        )?;
-        stream.write_all(page)
     }
 
     fn refused(&self, name: &str, reason: &str) {
@@ -253,45 +227,25 @@ impl Doors {
     /// Makes the connection a WebSocket and serves it.
     fn upgrade(
         &self,
-        mut stream: TcpStream,
+        stream: Connection,
         head: &Head,
         shared: &Shared,
         run: &str,
         name: &str,
     ) -> io::Result<()> {
-        let key = head.header("sec-websocket-key").filter(|key| key.len() == 24);
-        let is_asked = head.has("connection", "upgrade")
-            && head.has("upgrade", "websocket")
-            && head.header("sec-websocket-version") == Some("13");
-        let Some(key) = key.filter(|_| is_asked) else {
-            return head::sentence(&mut stream, "426 Upgrade Required", "Here the page opens its WebSocket.");
-        };
-        write!(
-            stream,
-            "HTTP/1.1 101 Switching Protocols\r\nConnection: Upgrade\r\nUpgrade: websocket\r\nSec-WebSocket-Accept: {}\r\n\r\n",
-            derive_accept_key(key.as_bytes())
-        )?;
-        let socket = WebSocket::from_raw_socket(stream, protocol::Role::Server, Some(session::config()));
+        let Some(socket) = entrance::upgrade(stream, head)? else { return Ok(()) };
         let Some(page) = shared.enter(MOST_PAGES) else {
-            self.refused(name, &format!("{MOST_PAGES} pages are open already"));
-            session::refuse(socket, &format!("{MOST_PAGES} pages are open already; close one of them"));
+            entrance::no_room(socket, name, &self.visits, &format!("{MOST_PAGES} pages"));
             return Ok(());
         };
-        let is_same_run = head.parameter("run") == Some(run);
-        let from =
-            head.parameter("after").and_then(|after| after.parse().ok()).filter(|_| is_same_run).unwrap_or(0);
-        (self.visits)(name, Visit::Came(self.role));
+        let live = Live { shared, run, visits: &self.visits, check: &|| Ok(()) };
         let visitor = Visitor { name: name.to_owned(), role: self.role };
-        let session = Session::new(socket, shared, visitor, &self.visits, from);
-        let result = session.map(|session| session.run(run));
-        drop(page);
-        (self.visits)(name, Visit::Left);
-        result
+        entrance::serve(socket, head, &live, page, visitor)
     }
 }
 
 /// The trace's bytes. A file that grows meanwhile is served as long as it was.
-fn trace(stream: &mut TcpStream, path: &Path) -> io::Result<()> {
+fn trace(stream: &mut Connection, path: &Path) -> io::Result<()> {
     let Ok(file) = File::open(path) else {
         return head::sentence(stream, "404 Not Found", "The trace is no longer there.");
     };

@@ -8,7 +8,6 @@
 
 use std::collections::VecDeque;
 use std::io;
-use std::net::TcpStream;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, TryRecvError};
 use std::time::{Duration, Instant};
@@ -18,8 +17,10 @@ use tungstenite::protocol::{CloseFrame, WebSocketConfig, frame::coding::CloseCod
 use tungstenite::{Error, Message as Frame, WebSocket};
 
 use crate::backlog::Cursor;
+use crate::entrance::{Connection, Live};
 use crate::request::Message;
 use crate::shared::{Answer, Shared};
+use crate::stream::is_idle;
 use crate::visits::{Visit, Visitor, Visits};
 
 /// How often what has arrived is passed on: as often as a screen is drawn.
@@ -39,10 +40,12 @@ const GONE_AFTER: Duration = Duration::from_secs(20);
 
 /// A page that is served.
 pub struct Session<'a> {
-    socket: WebSocket<TcpStream>,
+    socket: WebSocket<Connection>,
     shared: &'a Shared,
     page: Arc<Visitor>,
     visits: &'a Visits,
+    /// Whether it may still be there.
+    check: &'a dyn Fn() -> Result<(), String>,
     cursor: Cursor,
     /// The record after each message that is on its way, and the message's length.
     under_way: VecDeque<(u64, usize)>,
@@ -63,27 +66,22 @@ pub fn config() -> WebSocketConfig {
 }
 
 /// Ends a connection that is not served, with the reason.
-pub fn refuse(mut socket: WebSocket<TcpStream>, reason: &str) {
+pub fn refuse(mut socket: WebSocket<Connection>, reason: &str) {
     let _ = socket.close(Some(CloseFrame { code: CloseCode::Again, reason: reason.to_owned().into() }));
     let _ = socket.flush();
 }
 
 impl<'a> Session<'a> {
     /// Goes on after the records before `from`.
-    pub fn new(
-        socket: WebSocket<TcpStream>,
-        shared: &'a Shared,
-        page: Visitor,
-        visits: &'a Visits,
-        from: u64,
-    ) -> io::Result<Self> {
-        socket.get_ref().set_read_timeout(Some(TICK))?;
+    pub fn new(socket: WebSocket<Connection>, live: &Live<'a>, page: Visitor, from: u64) -> io::Result<Self> {
+        socket.get_ref().set_read_timeout(TICK)?;
         let now = Instant::now();
         Ok(Self {
             socket,
-            shared,
+            shared: live.shared,
             page: Arc::new(page),
-            visits,
+            visits: live.visits,
+            check: live.check,
             cursor: if from == 0 { Cursor::default() } else { Cursor::at(from) },
             under_way: VecDeque::new(),
             waiting: Vec::new(),
@@ -97,9 +95,16 @@ impl<'a> Session<'a> {
     /// Serves it until it leaves or the server ends.
     pub fn run(mut self, run: &str) {
         let hello = json!({ "type": "hello", "run": run, "version": env!("CARGO_PKG_VERSION") });
-        let _ = self.text(&hello).and_then(|()| self.serve());
-        let end = CloseFrame { code: CloseCode::Away, reason: "the server has ended".into() };
-        let _ = self.socket.close(self.shared.is_over().then_some(end));
+        let mut end = None;
+        if let Ok(Some(reason)) = self.text(&hello).and_then(|()| self.serve()) {
+            (self.visits)(&self.page.name, Visit::Refused(reason.clone()));
+            // A close frame's reason has at most 123 bytes; ours are ASCII, and a longer one is cut.
+            let reason: String = reason.chars().filter(char::is_ascii).take(120).collect();
+            end = Some(CloseFrame { code: CloseCode::Policy, reason: reason.into() });
+        } else if self.shared.is_over() {
+            end = Some(CloseFrame { code: CloseCode::Away, reason: "the server has ended".into() });
+        }
+        let _ = self.socket.close(end);
         let _ = self.socket.flush();
     }
 
@@ -107,7 +112,8 @@ impl<'a> Session<'a> {
         self.socket.send(Frame::text(value.to_string()))
     }
 
-    fn serve(&mut self) -> Result<(), Error> {
+    /// Returns why it is let go, if it is for a reason.
+    fn serve(&mut self) -> Result<Option<String>, Error> {
         while !self.shared.is_over() {
             self.tell_news()?;
             self.pass_records()?;
@@ -116,20 +122,23 @@ impl<'a> Session<'a> {
                     self.is_heard();
                     self.take(text.as_str())?;
                 }
-                Ok(Frame::Binary(_)) => return Ok(()),
+                Ok(Frame::Binary(_)) => return Ok(None),
                 Ok(_) => self.is_heard(),
                 Err(Error::Io(error)) if is_idle(&error) => {}
                 Err(error) => return Err(error),
             }
             if self.heard.elapsed() >= GONE_AFTER {
-                return Ok(());
+                return Ok(None);
             }
             if self.pinged.elapsed() >= PING_EVERY {
                 self.pinged = Instant::now();
+                if let Err(reason) = (self.check)() {
+                    return Ok(Some(reason));
+                }
                 self.socket.send(Frame::Ping(tungstenite::Bytes::new()))?;
             }
         }
-        Ok(())
+        Ok(None)
     }
 
     fn is_heard(&mut self) {
@@ -209,8 +218,4 @@ impl<'a> Session<'a> {
         }
         Ok(())
     }
-}
-
-fn is_idle(error: &io::Error) -> bool {
-    matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }

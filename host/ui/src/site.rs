@@ -37,10 +37,11 @@ impl Site {
         &self.page
     }
 
-    /// The header with the policy: the page's own, and connections to `host`, which was checked, alone.
-    pub fn policy(&self, host: &str) -> String {
+    /// The header with the policy: the page's own, and connections to `host`, which was checked, alone, in the way in which the page was fetched.
+    pub fn policy(&self, host: &str, is_encrypted: bool) -> String {
+        let [http, ws] = if is_encrypted { ["https", "wss"] } else { ["http", "ws"] };
         format!(
-            "Content-Security-Policy: {}; connect-src http://{host} ws://{host}; frame-ancestors 'none'\r\n",
+            "Content-Security-Policy: {}; connect-src {http}://{host} {ws}://{host}; frame-ancestors 'none'\r\n",
             self.policy
         )
     }
@@ -56,10 +57,11 @@ mod tests {
         let site = Site::new(page).unwrap();
         assert_eq!(site.page(), "<head></head>");
         assert_eq!(
-            site.policy("127.0.0.1:1"),
+            site.policy("127.0.0.1:1", false),
             "Content-Security-Policy: default-src 'none'; script-src 'sha256-x'; connect-src http://127.0.0.1:1 ws://127.0.0.1:1; \
              frame-ancestors 'none'\r\n"
         );
+        assert!(site.policy("vehicle:1", true).contains("; connect-src https://vehicle:1 wss://vehicle:1; "));
         assert_eq!(Site::new("<html></html>").err(), Some(SiteError));
         let forged = page.replace("'none';", "'none'\r\nX: y;");
         assert_eq!(Site::new(&forged).err(), Some(SiteError));

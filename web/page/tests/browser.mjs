@@ -20,8 +20,8 @@ export async function quit() {
 }
 
 /** A page; whatever it writes as an error, and each request that leaves it (or its server), fails the test in `done`. */
-export async function newPage({ file = FAKE, url = null, hash = '', theme = 'dark', size = { width: 1440, height: 900 }, before } = {}) {
-  const context = await (await launch()).newContext({ viewport: size, colorScheme: theme, acceptDownloads: true });
+export async function newPage({ file = FAKE, url = null, hash = '', theme = 'dark', size = { width: 1440, height: 900 }, before, more = {}, browser = launch } = {}) {
+  const context = await (await browser()).newContext({ viewport: size, colorScheme: theme, acceptDownloads: true, ...more });
   // A limit that only a fault reaches, on a busy machine, too.
   context.setDefaultTimeout(60_000);
   const page = await context.newPage();

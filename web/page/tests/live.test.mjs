@@ -6,7 +6,7 @@ import { existsSync, readFileSync, writeFileSync, mkdtempSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
 import { after, test } from 'node:test';
-import { newPage, quit, rowsInSight, show, until, untilText } from './browser.mjs';
+import { newPage, quit, rowsInSight, saved, show, until, untilText } from './browser.mjs';
 import { boardAt, serve } from './served.mjs';
 
 after(quit);
@@ -160,6 +160,49 @@ test('frames are sent once and periodically, after the user has agreed', () =>
     await show(page, 'device');
     await page.getByRole('button', { name: 'Stop 7F1#0000' }).click();
     await until(page, 'it has stopped', () => !document.querySelector('#view-device').textContent.includes('7F1#0000'));
+  }));
+
+test('a send list is kept, saved as the live view reads it, and added from its files', () =>
+  live(['-d', 'virtual', '-b', '500k', '--allow', 'send'], 'device', async (page, server) => {
+    const lines = () => page.locator('#send-list tr td:first-child').allTextContents();
+    const choose = async (text) => {
+      const [picker] = await Promise.all([page.waitForEvent('filechooser'), page.locator('#send-load').click()]);
+      await picker.setFiles([{ name: 'list.txt', mimeType: 'text/plain', buffer: Buffer.from(text) }]);
+    };
+    await page.getByRole('button', { name: 'Add once' }).click();
+    await untilText(page, '.notices', 'neither a frame');
+    await page.locator('#send-frame').fill('7F0#C0FFEE');
+    await page.getByRole('button', { name: 'Add once' }).click();
+    await page.locator('#send-frame').fill('7F1#0000');
+    await page.locator('#send-period').fill('20');
+    await page.locator('#send-changes').fill('checksum 1:xor, counter 0.0:4');
+    await page.getByRole('button', { name: 'Add periodic' }).click();
+    const own = ['1:7F0#C0FFEE', '1:7F1#0000 20ms checksum=1:xor counter=0.0:4'];
+    assert.deepEqual(await lines(), own);
+    assert.equal((await saved(page, () => page.locator('#send-save').click())).bytes.toString(), `${own.join('\n')}\n`);
+    // What the live view writes; a wrong line anywhere, and nothing of the file is taken.
+    const file = ['can1:7F2#0000 100ms counter=0 group=demo', '2:Engine:Speed=sine(0,120, 10s),Mode="on and off" 20ms', '7F3#R 1m30s'];
+    await choose(`# a comment\n\n${file.join('\r\n')}`);
+    await until(page, 'they are there', (count) => document.querySelectorAll('#send-list tr').length === count, own.length + file.length);
+    assert.deepEqual(await lines(), [...own, ...file]);
+    for (const [wrong, why] of [['7F0#00\n7F0#00 counter=0', 'line 2: counter='], ['7F0#00 20ms 30ms', 'one period too many'], ['7F0#00 5ms3s', 'is no period'], ['7F0#00 1ms sum=1', 'is unknown'], ['0:7F0#00', 'no channel 0'], ['hello', 'neither a frame']]) {
+      await choose(wrong);
+      await untilText(page, '.notices', why);
+    }
+    assert.equal((await lines()).length, own.length + file.length);
+    await page.getByRole('button', { name: 'Remove 7F3#R 1m30s' }).click();
+    assert.ok(await page.getByRole('button', { name: `Send ${own[0]}` }).isDisabled());
+    await page.getByRole('button', { name: 'Take part …' }).click();
+    await page.getByRole('dialog').getByRole('button', { name: 'Take part' }).click();
+    await untilText(page, '#live-mode', 'take part');
+    await page.getByRole('button', { name: `Send ${own[0]}` }).click();
+    await page.getByRole('button', { name: `Start ${own[1]}` }).click();
+    await page.getByRole('button', { name: 'Stop 7F1#0000' }).waitFor();
+    // Kept for the next visit.
+    await page.goto(server.url);
+    await show(page, 'device');
+    await until(page, 'the list is there', () => document.querySelectorAll('#send-list tr').length === 4);
+    await page.locator('#trace-filter').waitFor({ state: 'attached' });
   }));
 
 test('without --allow send the page offers nothing to send', () =>

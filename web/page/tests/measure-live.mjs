@@ -10,8 +10,21 @@ const { serve, serveShared } = await import('./served.mjs');
 const { launch, newPage, quit, show } = await import('./browser.mjs');
 
 const server = await (way === 'serve' ? serveShared : serve)(['-d', device, '-b', bitrate]);
-const tab = await newPage({ url: server.url });
+/** The engine's memory is its worker's own: the worker is made to show it. */
+const before = () => {
+  const show = 'const begin = WebAssembly.instantiate; WebAssembly.instantiate = async (...all) => { const made = await begin(...all); self.engineMemory = made.exports.memory; return made; };';
+  const Own = Blob;
+  window.Blob = class extends Own {
+    constructor(parts, options) {
+      super(options?.type === 'text/javascript' ? [show, ...parts] : parts, options);
+    }
+  };
+};
+const tab = await newPage({ url: server.url, before });
 await tab.locator('.shell').waitFor();
+const heap = await tab.context().newCDPSession(tab);
+await heap.send('Performance.enable');
+await heap.send('HeapProfiler.enable');
 const inspector = await (await launch()).newBrowserCDPSession();
 
 /** Megabytes in memory of a process. */
@@ -20,6 +33,14 @@ const memory = (pid) => Number(/VmRSS:\s+(\d+)/.exec(readFileSync(`/proc/${pid}/
 async function renderer() {
   const { processInfo } = await inspector.send('SystemInfo.getProcessInfo');
   return Math.max(...processInfo.filter((p) => p.type === 'renderer').map((p) => memory(p.id)));
+}
+
+/** Megabytes of the page's objects that are in use, and of the engine's memory. */
+async function inPage() {
+  await heap.send('HeapProfiler.collectGarbage');
+  const { metrics } = await heap.send('Performance.getMetrics');
+  const engine = await Promise.all(tab.workers().map((worker) => worker.evaluate(() => self.engineMemory?.buffer.byteLength ?? 0)));
+  return [metrics.find((m) => m.name === 'JSHeapUsedSize').value, Math.max(...engine)].map((bytes) => bytes / 1024 ** 2);
 }
 
 /** What happens in the page within some seconds: redraws of the browser, of the rows, the longest pause, and how far the newest record is behind the clock. */
@@ -55,7 +76,7 @@ const look = (ms) =>
   );
 
 const n = (value, digits = 0) => (value === undefined ? '–' : value.toFixed(digits));
-console.log('second  view      redraws/s  rows/s  longest ms  records/s  lag ms (worst)  behind  MB page  MB cantap  losses');
+console.log('second  view      redraws/s  rows/s  longest ms  records/s  lag ms (worst)  behind  MB page  MB objects  MB engine  MB cantap  losses');
 const views = ['trace', 'fixed', 'graphs'];
 const begin = Date.now();
 for (let round = 0; Date.now() - begin < Number(seconds) * 1000; round++) {
@@ -64,7 +85,8 @@ for (let round = 0; Date.now() - begin < Number(seconds) * 1000; round++) {
   if (view === 'trace' && round === 0) await tab.keyboard.press('F');
   if (view === 'graphs' && round === 2) for (const signal of (await tab.locator('.tree-signal, .tree-load').all()).slice(0, 2)) await signal.click();
   const found = await look(10_000);
-  console.log([n((Date.now() - begin) / 1000).padStart(6), view.padEnd(8), n(found.redraws, 1).padStart(10), n(found.rows, 1).padStart(7), n(found.longest).padStart(11), n(found.records).padStart(10), `${n(found.lag)} (${n(found.worst)})`.padStart(15), String(found.behind).padStart(7), n(await renderer()).padStart(8), n(memory(server.child.pid)).padStart(10), found.lost].join('  '));
+  const [objects, engine] = await inPage();
+  console.log([n((Date.now() - begin) / 1000).padStart(6), view.padEnd(8), n(found.redraws, 1).padStart(10), n(found.rows, 1).padStart(7), n(found.longest).padStart(11), n(found.records).padStart(10), `${n(found.lag)} (${n(found.worst)})`.padStart(15), String(found.behind).padStart(7), n(await renderer()).padStart(8), n(objects, 1).padStart(10), n(engine).padStart(9), n(memory(server.child.pid)).padStart(10), found.lost].join('  '));
 }
 await tab.context().close();
 await server.stop();

@@ -1,7 +1,7 @@
 // `cantap ui`, or `cantap serve --web`, for tests, in a folder of its own.
 
-import { spawn } from 'node:child_process';
-import { mkdtempSync, rmSync } from 'node:fs';
+import { spawn, spawnSync } from 'node:child_process';
+import { mkdtempSync, readFileSync, rmSync, writeFileSync } from 'node:fs';
 import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
 import { createInterface } from 'node:readline';
@@ -16,7 +16,7 @@ export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-
   child.stderr.on('data', (text) => (errors += text));
   const ended = new Promise((done) => child.on('close', done));
   const lines = createInterface({ input: child.stdout });
-  const url = await Promise.race([new Promise((found) => lines.on('line', (line) => line.startsWith('http://') && found(line))), ended]);
+  const url = await Promise.race([new Promise((found) => lines.on('line', (line) => /^https?:/.test(line) && found(line))), ended]);
   if (typeof url !== 'string') throw new Error(`cantap ${command[0]} ended: ${errors}`);
   return {
     url,
@@ -37,6 +37,25 @@ export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-
 
 /** The page beside the other listeners of `cantap serve`. */
 export const serveShared = (args) => serve(['--unix', 'cantap.sock', '--web', '0', ...args], { command: ['serve'] });
+
+/** The same over TLS, with keys for these clients (`NAME:ROLE`), and a file of permissions. */
+export async function serveEncrypted(clients, permissions, args) {
+  const folder = mkdtempSync(join(tmpdir(), 'cantap-tls-'));
+  const keygen = (...more) => {
+    const { status, stderr } = spawnSync(resolve(PROGRAM), ['serve', 'keygen', join(folder, 'keys'), ...more]);
+    if (status !== 0) throw new Error(stderr.toString());
+  };
+  keygen('--host', 'localhost', '--host', '127.0.0.1', ...clients.flatMap((client) => ['--client', client]));
+  writeFileSync(join(folder, 'permissions.toml'), permissions);
+  const files = ['--tls', 'keys/server.pem,keys/server-key.pem', '--clients', 'keys/ca.pem', '--permissions', 'permissions.toml', '--revoked', 'keys/revoked.pem', '--audit', 'audit.jsonl'];
+  // A list there has to be, so somebody is on it.
+  keygen('--client', 'nobody:listen');
+  keygen('--revoke', 'nobody');
+  const server = await serve(['--unix', 'cantap.sock', '--web', 'https://127.0.0.1:0', ...files, ...args], { folder, command: ['serve'] });
+  const file = (name) => join(folder, 'keys', `${name}.pem`);
+  const keyOf = (name) => ({ cert: readFileSync(file(name)), key: readFileSync(file(`${name}-key`)) });
+  return { ...server, keygen, keyOf, file, ca: readFileSync(file('ca')), audit: () => readFileSync(join(folder, 'audit.jsonl'), 'utf8').split('\n').filter(Boolean).map((line) => JSON.parse(line)) };
+}
 
 /** A virtual device that others reach at a socket, such as one on another machine: `cantap serve`. */
 export async function boardAt(socket) {

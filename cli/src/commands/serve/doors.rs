@@ -18,6 +18,8 @@ pub enum Door {
     Gvret,
     Cannelloni,
     Web,
+    /// The page for browsers that show certificates: `web`, too.
+    Https,
     Stdio,
 }
 
@@ -58,6 +60,7 @@ pub fn allow(all: &[Allowed], door: Door) -> Role {
         all.iter().rev().find(|allowed| allowed.door == door).map(|allowed| allowed.role)
     };
     let everywhere = if door.is_open_to_all() { None } else { of(None) };
+    let door = if door == Door::Https { Door::Web } else { door };
     of(Some(door)).or(everywhere).unwrap_or(Role::Listen)
 }
 

@@ -2,6 +2,7 @@
 
 mod keys;
 mod stream;
+mod visitors;
 
 use std::io;
 use std::net::{SocketAddr, TcpStream};
@@ -32,6 +33,7 @@ use crate::{Board, News, small_file};
 
 pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};
 use stream::{Secured, shake_hands};
+pub use visitors::{Sessions, Stream, Visitor, visitors};
 
 /// A peer that has not shown its certificate by this time is dropped.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -145,6 +147,8 @@ pub struct Server {
 struct Trust {
     config: Arc<ServerConfig>,
     clients: Arc<dyn ClientCertVerifier>,
+    /// Its own certificate.
+    own: CertificateDer<'static>,
 }
 
 impl Server {
@@ -202,13 +206,14 @@ impl Trust {
             clients = clients.with_crls([revocations(path)?]);
         }
         let clients = clients.build().map_err(setup)?;
+        let own = chain[0].clone();
         let config = ServerConfig::builder_with_provider(provider())
             .with_protocol_versions(&[&rustls::version::TLS13])
             .map_err(setup)?
             .with_client_cert_verifier(Arc::clone(&clients))
             .with_single_cert(chain, key)
             .map_err(setup)?;
-        Ok(Self { config: Arc::new(config), clients })
+        Ok(Self { config: Arc::new(config), clients, own })
     }
 }
 

@@ -26,7 +26,7 @@ fn hosted(board: &Arc<Board>, role: Role, linger: Duration) -> Device {
     let shared = Arc::clone(board);
     let link = Arc::new(move |_: usize| Ok(shared.link("the page", role)?));
     Device {
-        hosted: Some(Hosted { link, linger }),
+        hosted: Some(Hosted { link, may_use: Arc::new(|_| true), linger }),
         open: ChannelOptions::default(),
         role,
         folder: None,

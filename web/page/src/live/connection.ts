@@ -56,7 +56,7 @@ export class Connection extends Emitter<'status' | 'state' | 'progress'> impleme
     this.#set('connecting', this.reason);
     const token = new URLSearchParams(location.search).get('token') ?? '';
     const from = this.#takenRun === '' ? '' : `&run=${this.#takenRun}&after=${this.next}`;
-    const socket = new WebSocket(`ws://${location.host}/live?token=${token}${from}`);
+    const socket = new WebSocket(`${location.protocol === 'https:' ? 'wss' : 'ws'}://${location.host}/live?token=${token}${from}`);
     socket.binaryType = 'arraybuffer';
     this.#socket = socket;
     socket.onmessage = ({ data }: MessageEvent<string | ArrayBuffer>) => {

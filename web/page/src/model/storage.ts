@@ -1,6 +1,8 @@
 // What the page keeps between two visits: layout, theme, filters. A browser may refuse (files from disk, private windows): then nothing is kept,
 // and the page says so once instead of failing. The same text is the profile that a user saves as a file.
 
+import { parseEntry } from './send-entry';
+
 export interface Profile {
   cantapProfile: 1;
   theme: 'auto' | 'dark' | 'light';
@@ -9,11 +11,13 @@ export interface Profile {
   /** Graphs by names, since keys hold only as long as a database is loaded. */
   panels: { items: ProfileItem[]; style: string }[];
   filters: string[];
+  /** What is sent often, a line for each, as in a file of the live view's send list. */
+  sendList: string[];
 }
 
 export type ProfileItem = { kind: 'signal'; channel: number | null; id: number; extended: boolean; signal: string } | { kind: 'load'; channel: number };
 
-export const DEFAULT_PROFILE: Profile = { cantapProfile: 1, theme: 'auto', view: 'summary', timeStyle: 'relative', panels: [], filters: [] };
+export const DEFAULT_PROFILE: Profile = { cantapProfile: 1, theme: 'auto', view: 'summary', timeStyle: 'relative', panels: [], filters: [], sendList: [] };
 
 const KEY = 'cantap.profile';
 
@@ -48,6 +52,7 @@ export function parseProfile(text: string): Profile {
   const theme = raw['theme'];
   const timeStyle = raw['timeStyle'];
   const panels: unknown[] = Array.isArray(raw['panels']) ? raw['panels'] : [];
+  const sendList: unknown[] = Array.isArray(raw['sendList']) ? raw['sendList'] : [];
   const filters: unknown[] = Array.isArray(raw['filters']) ? raw['filters'] : [];
   return {
     cantapProfile: 1,
@@ -59,6 +64,7 @@ export function parseProfile(text: string): Profile {
       items: (Array.isArray(panel['items']) ? (panel['items'] as unknown[]) : []).flatMap(parseItem),
     })),
     filters: filters.filter((f): f is string => typeof f === 'string').slice(0, 30),
+    sendList: sendList.filter((line): line is string => typeof line === 'string' && isEntry(line)),
   };
 }
 
@@ -70,6 +76,14 @@ function parseItem(raw: unknown): ProfileItem[] {
     return [{ kind, channel: typeof channel === 'number' ? channel : null, id, extended: extended === true, signal }];
   }
   return [];
+}
+
+function isEntry(line: string): boolean {
+  try {
+    return parseEntry(line).text !== '';
+  } catch {
+    return false;
+  }
 }
 
 function isObject(value: unknown): value is Record<string, unknown> {

@@ -164,7 +164,7 @@ export class GraphsView implements View {
     if (!this.#visible) return;
     const { panels } = this.app;
     this.#shown = panels.list.map((panel) => this.#makePanel(panel));
-    replace(this.#panels, ...this.#shown.map((s) => s.element), panels.list.length === 0 ? el('p', { class: 'empty' }, 'Choose signals on the left, or drag them here.') : null);
+    replace(this.#panels, ...this.#shown.map((s) => s.element), panels.list.length === 0 ? el('p', { class: 'empty' }, 'Choose signals from the tree, or drag them here.') : null);
     this.redraw();
   }
 

@@ -1,9 +1,11 @@
-// Frames to be sent: once, or periodically by the device, which changes counters and checksums itself.
+// Frames to be sent: once, or periodically by the device, which changes counters and checksums itself; and the list of those that are sent often.
 
 import type { App } from '../model/app';
 import type { Connection } from '../live/connection';
 import { parseChanges } from '../live/modifiers';
 import type { State } from '../live/protocol';
+import { save } from '../model/files';
+import { entryText, parseEntry, parseList, type SendEntry } from '../model/send-entry';
 import { button, el, field, replace } from '../ui/dom';
 
 export class SendList {
@@ -15,7 +17,10 @@ export class SendList {
   readonly #once: HTMLButtonElement;
   readonly #start: HTMLButtonElement;
   readonly #running = el('tbody');
+  readonly #list = el('tbody', { id: 'send-list' });
+  readonly #none = el('p', { class: 'muted' }, 'Nothing is in the list. It is kept with the layout, and as a file it is the same as that of the live view (cantap monitor, page Send).');
   readonly #hint = el('p', { class: 'muted' });
+  #can = false;
   #drawn = '';
 
   constructor(
@@ -26,14 +31,20 @@ export class SendList {
     this.#start = button('Send periodically', () => this.#startPeriodic());
     this.#frame.addEventListener('keydown', (event) => event.key === 'Enter' && this.#sendOnce());
     const head = ['Channel', 'Frame', 'Period', ''];
+    const heads = (names: string[]): HTMLElement => el('thead', {}, el('tr', {}, ...names.map((h) => el('th', { attrs: { scope: 'col' } }, h))));
     this.element = el(
       'div',
       {},
       el('div', { class: 'row' }, field('Channel', this.#channel), field('Frame', this.#frame), this.#once),
       el('div', { class: 'row' }, field('Period / ms', this.#period), field('Changes', this.#changes, 'counter BYTE.LOWBIT:BITS, random BYTE, checksum BYTE:xor|sum|crc8'), this.#start),
       this.#hint,
-      el('table', { class: 'numbers' }, el('caption', {}, 'Sent by the device until it is stopped, or no page is open any more'), el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#running),
+      el('table', { class: 'numbers' }, el('caption', {}, 'Sent by the device until it is stopped, or no page is open any more'), heads(head), this.#running),
+      el('table', { class: 'numbers' }, el('caption', {}, 'Send list'), heads(['Entry', '']), this.#list),
+      this.#none,
+      el('div', { class: 'row' }, button('Add once', () => this.#add(false), { title: 'Puts channel and frame from above into the list' }), button('Add periodic', () => this.#add(true), { title: 'Puts channel, frame, period and changes from above into the list' }), button('Save the list …', () => save('send-list.txt', this.#text()), { id: 'send-save' }), button('Add a file …', () => this.#choose(), { id: 'send-load' })),
     );
+    app.on('profile', () => this.#drawList());
+    this.#drawList();
   }
 
   #refused = (error: unknown): void => this.app.failed(error);
@@ -56,6 +67,58 @@ export class SendList {
     }
   }
 
+  #text(): string {
+    return this.app.profile.sendList.map((line) => `${line}\n`).join('');
+  }
+
+  #keep(list: string[]): void {
+    this.app.profile.sendList = list;
+    this.app.saveProfile();
+  }
+
+  #add(periodic: boolean): void {
+    try {
+      const { channel, frame } = this.#on;
+      const periodMs = Number(this.#period.value.replace(',', '.'));
+      if (periodic && !(periodMs > 0)) throw new Error(`“${this.#period.value}” is no period: write milliseconds, such as 10 or 0.5.`);
+      const text = entryText(channel || 1, frame, periodic ? periodMs : null, parseChanges(this.#changes.value));
+      this.#keep([...this.app.profile.sendList, parseEntry(text).text]);
+    } catch (error) {
+      this.app.failed(error);
+    }
+  }
+
+  #choose(): void {
+    const picker = el('input', { attrs: { type: 'file', accept: '.txt,text/plain', 'aria-label': 'Send list' } });
+    picker.addEventListener('change', () => {
+      const file = picker.files?.[0];
+      const failed = (error: unknown): void => this.app.notify('error', `${file?.name}: ${error instanceof Error ? error.message : String(error)}`);
+      void file
+        ?.text()
+        .then((text) => this.#keep([...this.app.profile.sendList, ...parseList(text).map((entry) => entry.text)]))
+        .catch(failed);
+    });
+    picker.click();
+  }
+
+  #send({ channel, frame, periodMs, changes }: SendEntry): void {
+    const done = periodMs === null ? this.live.ask('send', { channel, frame }) : this.live.ask('periodic', { channel, frame, periodMs, modifiers: changes });
+    void done.catch(this.#refused);
+  }
+
+  #drawList(): void {
+    const { sendList } = this.app.profile;
+    this.#none.hidden = sendList.length > 0;
+    const row = (line: string, at: number): HTMLElement => {
+      const entry = parseEntry(line);
+      const run = button(entry.periodMs === null ? 'Send' : 'Start', () => this.#send(entry), { attrs: { 'aria-label': `${entry.periodMs === null ? 'Send' : 'Start'} ${line}` } });
+      run.disabled = !this.#can;
+      const remove = button('Remove', () => this.#keep(sendList.filter((_, other) => other !== at)), { attrs: { 'aria-label': `Remove ${line}` } });
+      return el('tr', {}, el('td', { class: 'mono' }, line), el('td', {}, run, ' ', remove));
+    };
+    replace(this.#list, ...sendList.map(row));
+  }
+
   draw(state: State): void {
     const key = JSON.stringify([state.periodic, state.channels.map((c) => c.channel), state.isNormal, state.maySend]);
     if (key === this.#drawn) return;
@@ -65,6 +128,8 @@ export class SendList {
     if (chosen !== '') this.#channel.value = chosen;
     const can = state.maySend && state.isNormal;
     this.#once.disabled = this.#start.disabled = !can;
+    this.#can = can;
+    this.#drawList();
     this.#hint.textContent = can ? '' : state.maySend ? 'The channels only listen: let them take part first.' : `This server only listens: start ${this.live.command} with ${state.sendOption}.`;
     this.#hint.hidden = can;
     replace(

@@ -81,7 +81,7 @@ impl Disturber {
             let began = pulse.disconnect();
             let now = capture.now(clock);
             let ticks = if began { now.saturating_sub(planned.at).min(planned.ticks.into()) } else { 0 };
-            self.record(channel, ticks as u16, planned.at, pulse, capture, now);
+            self.record(channel, ticks as u16, planned.at.min(now), pulse, capture, now);
         }
     }
 

@@ -84,7 +84,7 @@ pub fn clippy(shell: &Shell, toolchain: Toolchain) -> Result<()> {
     for feature in Board::ALL.map(|board| board.name().to_owned()).into_iter().chain(disturbing) {
         toolchain
             .cargo(shell, "clippy", &target_dir())?
-            .args(["-p", "cantap-firmware", "--no-default-features", "--features", feature])
+            .args(["-p", "cantap-firmware", "--no-default-features", "--features", &feature])
             .args(["--", "-D", "warnings"])
             .run()?;
     }

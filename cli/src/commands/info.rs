@@ -36,6 +36,7 @@ const CAPABILITIES: [(u32, &str); 12] = [
     (capability::NO_BIT_RATE, "no-bit-rate"),
     (capability::UNCOUNTED_LOSSES, "uncounted-losses"),
     (capability::FD_TRANSMIT, "fd-transmit"),
+    (capability::DISTURB, "disturb"),
 ];
 
 /// Runs it.

@@ -216,7 +216,14 @@ pub(super) fn fate(
             break;
         }
     }
-    fate.free_after = fate.levels.len() + INTERMISSION;
+    let flagged = fate.errors.iter().any(|(error, _)| participants[error.who].flags);
+    let over = match bits {
+        Some(bits) if fate.sent => bits.len(),
+        // Who flags without a dominant bit may be behind, and waits on its own.
+        _ if flagged => fate.recessive_from + DELIMITER,
+        _ => fate.levels.len(),
+    };
+    fate.free_after = over + INTERMISSION;
     fate
 }
 

@@ -204,6 +204,11 @@ impl Board {
         }
     }
 
+    /// Whether controller `n`'s TX pin drives its bus dominant now, as an output or for a timer.
+    pub fn drives(&self, n: usize) -> bool {
+        self.driven[n].dominant
+    }
+
     /// Core cycles for which controller `n`'s TX pin has driven its bus dominant without the controller, in levels that are over: as an
     /// output, or for a timer.
     pub fn driven_cycles(&self, n: usize) -> u64 {

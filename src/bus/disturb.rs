@@ -141,7 +141,8 @@ impl Disturber {
             self.write(event, at, pulse, capture, now);
         }
         let Some(planned) = self.planned else { return };
-        let end = planned.at + u64::from(planned.ticks);
+        // One tick for the timer that takes the trigger.
+        let end = planned.at + u64::from(planned.ticks) + 1;
         if planned.connected {
             if now < end {
                 return Self::arm(end, now, pulse);

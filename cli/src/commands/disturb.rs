@@ -78,6 +78,9 @@ const ERROR_BITS: u64 = 40;
 /// A level that has not been reported this long after its time never will be.
 const REPORTED_WITHIN_MS: u64 = 2000;
 
+/// What a level caused is on record within this time, on a bus that is never silent.
+const SETTLED_MS: u64 = 100;
+
 /// What became of one disturbance.
 struct Outcome {
     at_ticks: u64,
@@ -108,8 +111,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let bitrate_bps = opened.first().map_or(500_000, |(_, config)| config.timing.bitrate_bps(clock_hz));
     let run = Run { args, device: &device, bit_ns: 1_000_000_000 / u64::from(bitrate_bps.max(1)) };
     let done = run.all(&mut records);
-    device.stop()?;
+    let stopped = device.stop();
     let to_nothing = done?;
+    stopped?;
     Ok(if to_nothing == 0 { ExitCode::SUCCESS } else { ExitCode::from(exit::FAILURE) })
 }
 
@@ -224,8 +228,9 @@ impl Run<'_> {
                 let ended_ns = seen.iter().find_map(|record| next_frame(record, known.time_ns))?;
                 Some(ended_ns - expected.end_ns)
             });
-            let complete = expected.is_none() || known.late_ns.is_some() || now > at + self.ms(REPORTED_WITHIN_MS);
-            if complete && was_silent || now > at + 2 * self.ms(REPORTED_WITHIN_MS) || complete && now > at + self.ms(100) {
+            let complete = expected.is_none() || known.late_ns.is_some();
+            let patience_ms = if complete { SETTLED_MS } else { REPORTED_WITHIN_MS };
+            if complete && was_silent || now > at + self.ms(patience_ms) {
                 return Ok(outcome);
             }
         }

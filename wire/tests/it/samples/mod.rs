@@ -1,7 +1,7 @@
 //! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, GATEWAY_TAG,
+    ChannelConfig, ChannelStatus, Checksum, DISTURBANCE_WORD, Defaults, Edge, Edges, Failures, Filter, FrameKind, GATEWAY_TAG,
     GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic, RegisterSet, Registers,
     Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
 };

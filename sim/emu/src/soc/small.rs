@@ -60,11 +60,6 @@ impl Gpio {
         self.registers[MODER] >> (2 * pin) & 3 == 2 && chosen == function
     }
 
-    /// Whether a pin is connected to any peripheral.
-    pub fn is_alternate(&self, pin: u32) -> bool {
-        self.registers[MODER] >> (2 * pin) & 3 == 2
-    }
-
     /// A pin's level: what it drives if it is an output, what is applied otherwise.
     pub fn pin(&self, pin: u32) -> bool {
         let output = self.registers[MODER] >> (2 * pin) & 3 == 1;

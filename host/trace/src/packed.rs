@@ -235,7 +235,6 @@ impl<'a> Rest<'a> {
                 TraceEvent::TransmitFailed { tag, reason }
             }
             DISTURBED => TraceEvent::Disturbed { length_ns: self.u32()? },
-            _ => return None,
         };
         Some(TraceRecord { time_ns, channel, event })
     }

@@ -13,7 +13,7 @@ use cantap_emu::usb_host::Timing;
 use cantap_sim::board::{self, CLOCK};
 use cantap_sim::firmware;
 use cantap_sim::rig::{MS, Rig, RigError, timing};
-use cantap_wire::Channel::{self, Can1, Can2};
+use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::message::{
     ChannelConfig, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS, Mode, TxFrame,
 };

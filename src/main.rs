@@ -336,8 +336,8 @@ mod app {
         // Short locks, so that the transmission alarm can come between them: it fires 14 µs early, and a lock, a drain and its
         // own work have to fit into that.
         for channel in Channel::ALL {
-            let emptied =
-                tap.lock(|Tap { capture, traffic, alarm, .. }| capture.on_tick_receive(channel, traffic, alarm));
+            let emptied = tap
+                .lock(|Tap { capture, traffic, alarm, .. }| capture.on_tick_receive(channel, traffic, alarm));
             match channel {
                 _ if !emptied => {}
                 Channel::Can1 => can1_bells.open_receive(),

@@ -251,7 +251,9 @@ impl Record {
             TraceEvent::BusError { kind, .. } => kind.map(BusErrorKind::name),
             TraceEvent::State { state, .. } => Some(state.name()),
             TraceEvent::TransmitFailed { reason, .. } => Some(reason.name()),
-            TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } | TraceEvent::Disturbed { .. } => None,
+            TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } | TraceEvent::Disturbed { .. } => {
+                None
+            }
         }
     }
 

@@ -5,7 +5,8 @@
 //! just after. In between, the controller neither acknowledges nor flags errors; it still receives, so nothing is lost by it.
 
 use cantap_wire::message::{
-    ChannelConfig, DISTURBANCE_LEAD_TICKS, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS, Mode,
+    ChannelConfig, DISTURBANCE_LEAD_TICKS, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS,
+    Mode,
 };
 use cantap_wire::{Channel, Event, Refusal};
 

@@ -16,8 +16,8 @@
 //! A debugger's halt does not stop TIM4 (RM0090, DBGMCU_APB1_FZ, which is left as after a reset). What no timer survives is the loss of its
 //! clock: if the crystal stops within the pulse, the pin stays low until the chip is reset, as it does in a frame.
 
-use cantap_firmware::ports::PulseTimer;
 use cantap_firmware::TICK_HZ;
+use cantap_firmware::ports::PulseTimer;
 use cantap_wire::Channel;
 use stm32f4xx_hal::pac::{GPIOB, TIM4};
 use stm32f4xx_hal::rcc::{BusTimerClock, Enable, Rcc, Reset};

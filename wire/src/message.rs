@@ -19,7 +19,9 @@ mod transmission;
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
 #[cfg(any(feature = "disturb", not(target_os = "none")))]
-pub use disturbance::{DISTURBANCE_LEAD_TICKS, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS};
+pub use disturbance::{
+    DISTURBANCE_LEAD_TICKS, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS,
+};
 pub use edges::{Edge, Edges, MAX_EDGES};
 pub use gateway::{
     GATEWAY_TAG, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, MAX_GATEWAY_RULES, MAX_RULE_COUNTS,

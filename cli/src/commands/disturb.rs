@@ -105,7 +105,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let options = ChannelOptions { timing: args.timing.options(), ..ChannelOptions::default() };
     let mut records = device.records();
-    let opened = options.open(&device, [args.channel].into_iter(), Mode::Normal, None, &stderr::reporter())?;
+    let opened =
+        options.open(&device, [args.channel].into_iter(), Mode::Normal, None, &stderr::reporter())?;
     device.unlock_disturbances()?;
     let clock_hz = device.hello().can_clock_hz;
     let bitrate_bps = opened.first().map_or(500_000, |(_, config)| config.timing.bitrate_bps(clock_hz));
@@ -134,7 +135,8 @@ impl Run<'_> {
         let ticks = |time: Duration| (time.as_secs_f64() * per_second) as u64;
         let began = self.device.time()?;
         let every = ticks(self.args.every).max(self.ms(LEAD_MS));
-        let mut prediction = self.args.id.map(|id| Prediction::new(id, self.args.channel.number(), self.bit_ns));
+        let mut prediction =
+            self.args.id.map(|id| Prediction::new(id, self.args.channel.number(), self.bit_ns));
         let mut to_nothing = 0;
         for round in 0..u64::from(self.args.count) {
             let expected = match &mut prediction {
@@ -150,7 +152,9 @@ impl Run<'_> {
                 None => began + ticks(self.args.at.unwrap_or_default()) + round * every,
             };
             let at = if expected.is_some() { at } else { at.max(self.device.time()? + self.ms(LEAD_MS)) };
-            let Some(outcome) = self.disturb(at, expected.as_ref(), prediction.as_mut(), records)? else { break };
+            let Some(outcome) = self.disturb(at, expected.as_ref(), prediction.as_mut(), records)? else {
+                break;
+            };
             to_nothing += u32::from(outcome.length_ns == 0);
             self.print(&outcome)?;
         }
@@ -171,7 +175,9 @@ impl Run<'_> {
                 return Ok(Some(expected));
             }
             let Some(batch) = records.next_batch(LOOK_EVERY)? else { return Ok(None) };
-            batch.iter().for_each(|record| prediction.take(record));
+            for record in &batch {
+                prediction.take(record);
+            }
             records.recycle(batch);
         }
         Ok(None)
@@ -260,7 +266,11 @@ impl Run<'_> {
             };
             write!(out, "({seconds}.{us:06}) can{} {event}; {errors}", self.args.channel.index())?;
             if let Some(late_ns) = late_ns {
-                write!(out, "; the next frame ended {:.1} us later than predicted", *late_ns as f64 / 1000.0)?;
+                write!(
+                    out,
+                    "; the next frame ended {:.1} us later than predicted",
+                    *late_ns as f64 / 1000.0
+                )?;
             }
             writeln!(out)?;
         }

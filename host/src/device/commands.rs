@@ -1,8 +1,8 @@
 //! The requests to a device, one method each.
 
 use cantap_wire::message::{
-    ChannelConfig, DISTURBANCE_WORD, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic, Registers,
-    Status, Trigger, TxFdFrame, TxFrame,
+    ChannelConfig, DISTURBANCE_WORD, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic,
+    Registers, Status, Trigger, TxFdFrame, TxFrame,
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 

@@ -63,7 +63,8 @@ impl Prediction {
         let Some(last_ns) = self.ends_ns.back().copied().filter(|_| self.ends_ns.len() >= LEAST) else {
             return Ok(None);
         };
-        let mut gaps: Vec<i64> = self.ends_ns.iter().zip(self.ends_ns.iter().skip(1)).map(|(a, b)| b - a).collect();
+        let mut gaps: Vec<i64> =
+            self.ends_ns.iter().zip(self.ends_ns.iter().skip(1)).map(|(a, b)| b - a).collect();
         gaps.sort_unstable();
         let period_ns = gaps[gaps.len() / 2].max(1);
         // One that was disturbed comes late, and the next early: the rest must agree.

@@ -111,9 +111,14 @@ pub(super) struct Fate {
 enum State {
     Sending,
     Receiving(Parser),
-    Flag { left: usize },
+    Flag {
+        left: usize,
+    },
     /// After its flag; the error's index, until it is known whether others' dominant bits follow.
-    Waiting { recessive: usize, error: Option<usize> },
+    Waiting {
+        recessive: usize,
+        error: Option<usize>,
+    },
     Over,
 }
 
@@ -270,7 +275,12 @@ mod tests {
         use BusErrorKind::{Crc, Form, Stuff};
         let texts = ["123#1122", "000#55", "7FF#FFFFFFFFFFFFFFFF", "1ABCDEF0#00", "555#R3"];
         for bits in texts.map(|text| FrameBits::new(&text.parse().unwrap())) {
-            let own = [None, Some((20, Stuff)), Some((bits.ack_delimiter(), Crc)), Some((bits.crc_delimiter(), Form))];
+            let own = [
+                None,
+                Some((20, Stuff)),
+                Some((bits.ack_delimiter(), Crc)),
+                Some((bits.crc_delimiter(), Form)),
+            ];
             for own in own {
                 let confused = Participant { own, ..RECEIVER };
                 for others in [&[confused][..], &[LISTENER, confused], &[confused, PASSIVE, RECEIVER]] {
@@ -311,7 +321,9 @@ mod tests {
     /// Six equal bits anywhere before the CRC delimiter violate the stuffing rule.
     #[test]
     fn six_bits_destroy_a_frame_wherever_they_begin() {
-        for bits in ["123#1122", "000#0000000000000000", "7FF#"].map(|text| FrameBits::new(&text.parse().unwrap())) {
+        for bits in
+            ["123#1122", "000#0000000000000000", "7FF#"].map(|text| FrameBits::new(&text.parse().unwrap()))
+        {
             for at in 1..bits.len() - 2 {
                 let fate = pulse(&bits, &[SENDER, RECEIVER, LISTENER], at, 6);
                 assert!(!fate.sent && !fate.takers.contains(&1), "bit {at}: {fate:?}");
@@ -325,10 +337,10 @@ mod tests {
         let bits = FrameBits::new(&"7F0#".parse().unwrap());
         let fate = pulse(&bits, &[SENDER, RECEIVER], 2, 1);
         assert_eq!(fate.lost, [(0, 2)]);
-        assert_eq!(fate.errors.iter().map(|(one, sends)| (one.kind, *sends)).collect::<Vec<_>>(), [
-            (BusErrorKind::Stuff, false),
-            (BusErrorKind::Stuff, false)
-        ]);
+        assert_eq!(
+            fate.errors.iter().map(|(one, sends)| (one.kind, *sends)).collect::<Vec<_>>(),
+            [(BusErrorKind::Stuff, false), (BusErrorKind::Stuff, false)]
+        );
         assert!(!fate.sent);
     }
 
@@ -336,11 +348,10 @@ mod tests {
     #[test]
     fn a_glitch_on_an_idle_bus_is_an_error_of_all_that_listen() {
         let fate = fate(None, &[RECEIVER, PASSIVE, LISTENER], |n| n == 0, |_, _| false);
-        assert_eq!(seen(&fate), [
-            (0, 6, BusErrorKind::Stuff),
-            (1, 6, BusErrorKind::Stuff),
-            (2, 6, BusErrorKind::Stuff)
-        ]);
+        assert_eq!(
+            seen(&fate),
+            [(0, 6, BusErrorKind::Stuff), (1, 6, BusErrorKind::Stuff), (2, 6, BusErrorKind::Stuff)]
+        );
         assert_eq!((fate.recessive_from, fate.free_after), (13, 13 + 8 + 3));
     }
 

@@ -24,8 +24,8 @@ use crate::can::{CanPair, Mode};
 use bits::FrameBits;
 use driven::Outside;
 pub use node::{BitTime, Node, Source};
-use outcome::{Detection, Participant};
 pub use outcome::Disturbance;
+use outcome::{Detection, Participant};
 pub use waveform::Edge;
 use waveform::Waveform;
 

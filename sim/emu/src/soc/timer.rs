@@ -240,7 +240,8 @@ impl Timer {
                 && matches!(self.output_mode(*channel), PWM_1 | PWM_2)
         };
         let pulses = (0..4).filter(is_pwm);
-        let edges = pulses.flat_map(|channel| [self.ticks_to(self.compare[channel]), Some(self.ticks_to_update())]);
+        let edges =
+            pulses.flat_map(|channel| [self.ticks_to(self.compare[channel]), Some(self.ticks_to_update())]);
         let rises = self.awaits_rise().then(|| self.ticks_to(self.compare[1]));
         let ticks = edges.chain(rises).flatten().min()?;
         Some(self.since + ticks * self.tick())
@@ -459,7 +460,8 @@ mod tests {
         let at = master.take_trigger().unwrap();
         assert_eq!((at, master.take_trigger(), master.next_event()), (1200, None, None));
         pulse.internal_trigger(1, at);
-        for (now, level) in [(1211, true), (1212, false), (1212 + 72 * 12 - 1, false), (1212 + 72 * 12, true)] {
+        for (now, level) in [(1211, true), (1212, false), (1212 + 72 * 12 - 1, false), (1212 + 72 * 12, true)]
+        {
             pulse.advance(now);
             assert_eq!(pulse.output_level(0), Some(level), "{now}");
         }

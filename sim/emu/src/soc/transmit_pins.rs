@@ -43,12 +43,11 @@ pub fn driven(ports: &[Gpio], timer: &Timer) -> [Driven; 2] {
     [0, 1].map(|controller| {
         let is_low = |(port, pin): &(usize, u32)| ports[*port].output(*pin) == Some(false);
         let is_output_low = TX[controller].iter().any(is_low);
-        let of_timer = TIM4_TX.iter().find(|(of, port, pin, _)| {
-            *of == controller && ports[*port].is_connected(*pin, TIM4)
-        });
+        let of_timer = TIM4_TX
+            .iter()
+            .find(|(of, port, pin, _)| *of == controller && ports[*port].is_connected(*pin, TIM4));
         // An output that is not enabled is no level: the transceiver reads recessive.
-        let is_timer_low =
-            of_timer.is_some_and(|(.., channel)| timer.output_level(*channel) == Some(false));
+        let is_timer_low = of_timer.is_some_and(|(.., channel)| timer.output_level(*channel) == Some(false));
         Driven {
             dominant: is_output_low || is_timer_low,
             cut: (is_output_low || of_timer.is_some()) && !is_connected(controller, ports),

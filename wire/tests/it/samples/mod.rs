@@ -1,9 +1,9 @@
 //! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, DISTURBANCE_WORD, Defaults, Edge, Edges, Failures, Filter, FrameKind, GATEWAY_TAG,
-    GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic, RegisterSet, Registers,
-    Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
+    ChannelConfig, ChannelStatus, Checksum, DISTURBANCE_WORD, Defaults, Edge, Edges, Failures, Filter,
+    FrameKind, GATEWAY_TAG, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic,
+    RegisterSet, Registers, Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, FdFrame, Frame, Hello, Id, Refusal, Reply};

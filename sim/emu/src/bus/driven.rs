@@ -300,7 +300,7 @@ mod tests {
     #[test]
     fn a_level_over_a_recessive_bit_is_the_sender_s_bit_error_and_the_receivers_answer() {
         let bits = FrameBits::new(&"123#1122".parse().unwrap());
-        let at = (20..).find(|n| bits.levels()[*n]).unwrap();
+        let at = (20..bits.len()).find(|n| bits.levels()[*n]).unwrap();
         let fate = pulse(&bits, &[SENDER, RECEIVER], at, 1);
         let found = seen(&fate);
         assert_eq!(found[0], (0, at, BusErrorKind::BitRecessive));
@@ -314,7 +314,7 @@ mod tests {
     #[test]
     fn a_level_over_dominant_bits_only_does_nothing() {
         let bits = FrameBits::new(&"000#0000".parse().unwrap());
-        let at = (20..).find(|n| !bits.levels()[*n]).unwrap();
+        let at = (20..bits.len()).find(|n| !bits.levels()[*n]).unwrap();
         assert_eq!(pulse(&bits, &[SENDER, RECEIVER], at, 1), untouched(&bits, &[SENDER, RECEIVER]));
     }
 
@@ -358,7 +358,7 @@ mod tests {
     #[test]
     fn a_sender_whose_pin_is_taken_away_finds_a_recessive_bus() {
         let bits = FrameBits::new(&"123#1122".parse().unwrap());
-        let at = (25..).find(|n| !bits.levels()[*n]).unwrap();
+        let at = (25..bits.len()).find(|n| !bits.levels()[*n]).unwrap();
         let cut = |who, n| who == 0 && n >= at;
         let fate = fate(Some(&bits), &[SENDER, RECEIVER], |_| false, cut);
         assert_eq!(seen(&fate)[0], (0, at, BusErrorKind::BitDominant));

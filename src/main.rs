@@ -107,6 +107,8 @@ mod app {
         let Hardware {
             can,
             alarm,
+            #[cfg(feature = "disturb")]
+            pulse,
             sof,
             tick,
             crc,
@@ -126,7 +128,15 @@ mod app {
         let (producer, consumer) = records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer, tx_memory, lanes), traffic: can.traffic, alarm },
+                tap: Tap {
+                    capture: Capture::new(producer, tx_memory, lanes),
+                    traffic: can.traffic,
+                    alarm,
+                    #[cfg(feature = "disturb")]
+                    disturber: cantap_firmware::bus::disturb::Disturber::new(),
+                    #[cfg(feature = "disturb")]
+                    pulse,
+                },
                 stamp,
                 catcher,
                 can1_bells,
@@ -170,7 +180,7 @@ mod app {
     #[task(binds = CAN1_RX1, priority = 4, shared = [tap, &can1_bells, &can1_entered])]
     fn can1_drain(mut cx: can1_drain::Context) {
         let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
-        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm, .. }| {
             capture.on_receive(Channel::Can1, traffic, alarm, entered)
         });
         if emptied {
@@ -183,7 +193,7 @@ mod app {
     #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
         let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
-        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+        let emptied = cx.shared.tap.lock(|Tap { capture, traffic, alarm, .. }| {
             capture.on_receive(Channel::Can2, traffic, alarm, entered)
         });
         if emptied {
@@ -216,7 +226,7 @@ mod app {
     /// mailboxes is stamped when it is found.
     #[task(binds = USART2, priority = 4, shared = [tap])]
     fn can1_sent(mut cx: can1_sent::Context) {
-        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm, .. }| {
             let entered = traffic[0].stamped();
             capture.on_transmit(Channel::Can1, traffic, alarm, entered);
         });
@@ -225,7 +235,7 @@ mod app {
     /// Same as [`can1_sent`], for CAN2, with USART3.
     #[task(binds = USART3, priority = 4, shared = [tap])]
     fn can2_sent(mut cx: can2_sent::Context) {
-        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm, .. }| {
             let entered = traffic[1].stamped();
             capture.on_transmit(Channel::Can2, traffic, alarm, entered);
         });
@@ -265,7 +275,9 @@ mod app {
     /// Priority 4, because it writes mailboxes and records. Each microsecond of delay makes a frame a microsecond late.
     #[task(binds = TIM2, priority = 4, shared = [tap])]
     fn tim2(mut cx: tim2::Context) {
-        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+        #[cfg(feature = "disturb")]
+        cx.shared.tap.lock(crate::hw::access::Tap::on_pulse_alarm);
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm, .. }| {
             alarm.acknowledge();
             capture.on_alarm(traffic, alarm);
         });
@@ -324,14 +336,14 @@ mod app {
         // Short locks, so that the transmission alarm can come between them: it fires 14 µs early, and a lock, a drain and its
         // own work have to fit into that.
         for channel in Channel::ALL {
-            let emptied =
-                tap.lock(|Tap { capture, traffic, alarm }| capture.on_tick_receive(channel, traffic, alarm));
+            let emptied = tap
+                .lock(|Tap { capture, traffic, alarm, .. }| capture.on_tick_receive(channel, traffic, alarm));
             match channel {
                 _ if !emptied => {}
                 Channel::Can1 => can1_bells.open_receive(),
                 Channel::Can2 => can2_bells.open_receive(),
             }
-            let (is_open, may_come) = tap.lock(|Tap { capture, traffic, alarm }| {
+            let (is_open, may_come) = tap.lock(|Tap { capture, traffic, alarm, .. }| {
                 let is_open = capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm);
                 (is_open, capture.take_errors_held(channel))
             });
@@ -344,7 +356,7 @@ mod app {
                 continue;
             }
             for _ in 0..CALLS_PER_TICK {
-                let more = tap.lock(|Tap { capture, traffic, alarm }| {
+                let more = tap.lock(|Tap { capture, traffic, alarm, .. }| {
                     capture.on_tick_queues(channel, &mut traffic[channel.index()], alarm)
                 });
                 if !more {

@@ -115,6 +115,22 @@ pub trait Control {
     fn resume(&mut self);
 }
 
+/// The timer that drives a TX pin dominant for a while, once, in place of its controller.
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+pub trait PulseTimer {
+    /// Whether a channel's TX pin has such a timer.
+    fn reaches(&self, channel: cantap_wire::Channel) -> bool;
+    /// Sets the timer up, for a level of this many ticks that begins when the stamp timer is at `at`, less than half its range ahead. The pin
+    /// stays its controller's.
+    fn prepare(&mut self, channel: cantap_wire::Channel, at: u32, ticks: u16);
+    /// Connects the timer, which was prepared, to the pin: recessive until the level begins, and after it.
+    fn connect(&mut self, channel: cantap_wire::Channel);
+    /// Gives the pin back to its controller, and stops the timer. Returns whether the level had begun since [`Self::prepare`].
+    fn disconnect(&mut self) -> bool;
+    /// As [`Clock::set_alarm`], an alarm of its own.
+    fn set_alarm(&mut self, at: Option<u32>);
+}
+
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
     /// Compares the banks as they are now with the layout, and writes those that differ. Reception is interrupted, so no channel may

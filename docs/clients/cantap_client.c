@@ -25,7 +25,7 @@ static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Un
                                        "BadTag", "BadEntry", "BadSlot", "ChannelOpen", "ChannelClosed", "ListenOnly", "QueueFull",
                                        "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff",
                                        "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard",
-                                       "NotNormal", "GatewayRunning"};
+                                       "NotNormal", "GatewayRunning", "DisturbanceLocked", "TooOften", "TooLate"};
 static const char *const STAGES[] = {"controller", "queue", "link", "host", "gateway"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};
@@ -172,6 +172,7 @@ static uint64_t event_record(uint8_t index, Reader *m, uint64_t ticks) {
         if (b == 5) fprintf(out, " %" PRIu64, number(m));
         break;
     case 8: a = number(m), b = number(m); fprintf(out, "sof %" PRIu64 " doubled %" PRIu64, a, b); break;
+    case 9: fprintf(out, "disturbed %" PRIu64, number(m)); break;
     default: m->ok = false; /* a record of a newer protocol: nothing after it can be read */
     }
     fclose(out);

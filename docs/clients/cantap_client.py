@@ -10,7 +10,8 @@ PROTOCOL = 7
 REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges Gateway GatewayRule".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
-            "NotMeasuring NotGranted Held OtherSettings NoBoard NotNormal GatewayRunning").split()
+            "NotMeasuring NotGranted Held OtherSettings NoBoard NotNormal GatewayRunning "
+            "DisturbanceLocked TooOften TooLate").split()
 NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers after a refusal
 STAGES = "controller queue link host gateway".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
@@ -184,6 +185,8 @@ class Stream:
         elif index == 7:
             tag, reason = m.number(), m.number()
             text = f"not-sent tag {tag} {FAILURES[reason]}" + (f" {m.number()}" if reason == 5 else "")
+        elif index == 9:
+            text = f"disturbed {m.number()}"
         else:
             raise IndexError  # a record of a newer protocol: nothing after it can be read
         return self.told(f"can{channel + 1} {text}", m, ticks)

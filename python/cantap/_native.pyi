@@ -307,7 +307,8 @@ class Record:
         """The channel, from 1."""
     @property
     def event(self) -> str:
-        """The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`."""
+        """The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`,
+        `disturbed`."""
     @property
     def detail(self) -> str | None:
         """Where frames were lost, which error, which state, why not sent."""

@@ -228,7 +228,8 @@ impl Record {
         self.0.channel
     }
 
-    /// The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`.
+    /// The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`,
+    /// `disturbed`.
     #[getter]
     fn event(&self) -> &'static str {
         match self.0.event {
@@ -238,6 +239,7 @@ impl Record {
             TraceEvent::ErrorsSuppressed { .. } => "errors-suppressed",
             TraceEvent::State { .. } => "state",
             TraceEvent::TransmitFailed { .. } => "transmit-failed",
+            TraceEvent::Disturbed { .. } => "disturbed",
         }
     }
 
@@ -249,15 +251,19 @@ impl Record {
             TraceEvent::BusError { kind, .. } => kind.map(BusErrorKind::name),
             TraceEvent::State { state, .. } => Some(state.name()),
             TraceEvent::TransmitFailed { reason, .. } => Some(reason.name()),
-            TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } => None,
+            TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } | TraceEvent::Disturbed { .. } => {
+                None
+            }
         }
     }
 
-    /// Frames lost, errors suppressed, periods that passed.
+    /// Frames lost, errors suppressed, periods that passed; of a disturbance the nanoseconds, 0 if it came to nothing.
     #[getter]
     fn count(&self) -> Option<u32> {
         match self.0.event {
-            TraceEvent::Lost { count, .. } | TraceEvent::ErrorsSuppressed { count } => Some(count),
+            TraceEvent::Lost { count, .. }
+            | TraceEvent::ErrorsSuppressed { count }
+            | TraceEvent::Disturbed { length_ns: count } => Some(count),
             TraceEvent::TransmitFailed { reason: TransmitFailure::Overtaken { periods }, .. } => {
                 Some(periods)
             }

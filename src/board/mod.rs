@@ -143,3 +143,23 @@ pub enum Leds {
         error: Led,
     },
 }
+
+/// A TX pin that is an output of TIM4, too (STM32F405 data sheet, "Alternate function mapping", AF2).
+#[cfg(feature = "disturb")]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PulsePin {
+    /// Channel 1.
+    B6,
+    /// Channel 4.
+    B9,
+}
+
+/// Each channel's TX, if it is one. PD1 is no timer's; PB13 is a complementary output of TIM1, which this firmware does not use.
+#[cfg(feature = "disturb")]
+pub const PULSE_PINS: [Option<PulsePin>; 2] = if cfg!(feature = "olimex-p405") {
+    [Some(PulsePin::B9), Some(PulsePin::B6)]
+} else if cfg!(feature = "feather-f405") {
+    [Some(PulsePin::B9), None]
+} else {
+    [None, None]
+};

@@ -716,3 +716,6 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.fill()
     }
 }
+
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+mod disturb;

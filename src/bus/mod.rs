@@ -5,6 +5,8 @@
 
 pub mod capture;
 pub mod checksum;
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+pub mod disturb;
 pub mod errors;
 pub mod filters;
 pub mod gateway;

@@ -23,6 +23,22 @@ pub struct Tap {
     pub traffic: [CanTraffic; CHANNELS],
     /// The stamp timer with its alarm.
     pub alarm: StampAlarm,
+    /// What disturbs a bus.
+    #[cfg(feature = "disturb")]
+    pub disturber: cantap_firmware::bus::disturb::Disturber,
+    /// Its timer.
+    #[cfg(feature = "disturb")]
+    pub pulse: super::disturb::BusPulse,
+}
+
+#[cfg(feature = "disturb")]
+impl Tap {
+    /// The stamp timer's interrupt: it may be the alarm of a disturbance.
+    pub fn on_pulse_alarm(&mut self) {
+        let Self { capture, alarm, disturber, pulse, .. } = self;
+        pulse.acknowledge();
+        disturber.on_alarm(pulse, capture, alarm);
+    }
 }
 
 /// What commands own.
@@ -64,6 +80,26 @@ impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
         act: impl FnOnce(&mut Capture<'static>, &mut [CanTraffic; CHANNELS], &StampAlarm) -> R,
     ) -> R {
         self.tap.lock(|tap| act(&mut tap.capture, &mut tap.traffic, &tap.alarm))
+    }
+
+    #[cfg(feature = "disturb")]
+    fn with_disturber<R>(
+        &mut self,
+        act: impl FnOnce(
+            &mut cantap_firmware::bus::disturb::Disturber,
+            &mut dyn cantap_firmware::ports::PulseTimer,
+            &mut Capture<'static>,
+            &StampAlarm,
+        ) -> R,
+    ) -> Option<R> {
+        self.tap.lock(|tap| Some(act(&mut tap.disturber, &mut tap.pulse, &mut tap.capture, &tap.alarm)))
+    }
+
+    #[cfg(feature = "disturb")]
+    fn describe(&self, hello: &mut cantap_wire::Hello) {
+        if crate::board::PULSE_PINS.iter().any(Option::is_some) {
+            hello.capabilities |= cantap_wire::message::capability::DISTURB;
+        }
     }
 
     fn now(&self) -> u32 {

@@ -8,6 +8,8 @@ pub mod chip;
 mod clocks;
 mod copy;
 pub mod crc;
+#[cfg(feature = "disturb")]
+pub mod disturb;
 pub mod edges;
 mod entry;
 mod failure;
@@ -60,6 +62,9 @@ pub struct Hardware {
     pub can: can::Controllers,
     /// The stamp timer with its alarm.
     pub alarm: stamp::StampAlarm,
+    /// What drives a TX pin in place of its controller.
+    #[cfg(feature = "disturb")]
+    pub pulse: disturb::BusPulse,
     /// Its latch of USB's start of frame.
     pub sof: sof::SofLatch,
     /// The millisecond tick.
@@ -116,6 +121,8 @@ pub fn start(
     Hardware {
         can: can::Controllers::new((device.CAN1, device.CAN2), transmit, &mut rcc, sent_at),
         sof: sof::SofLatch::start(timer),
+        #[cfg(feature = "disturb")]
+        pulse: disturb::BusPulse::start(device.TIM4, timer, &mut rcc),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),

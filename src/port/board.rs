@@ -4,7 +4,11 @@ use cantap_wire::framing;
 use cantap_wire::{CHANNELS, Channel, Command, Hello, Refusal};
 
 use crate::bus::capture::Capture;
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+use crate::bus::disturb::Disturber;
 use crate::bus::sof::SofReading;
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+use crate::ports::PulseTimer;
 use crate::ports::{Chip, Clock, Control, EdgeMeter, FilterBanks, Traffic};
 
 /// All of the hardware, and access to the buses' state.
@@ -44,6 +48,15 @@ pub trait Board<'q, const N: usize> {
     fn chip(&mut self) -> &mut Self::Chip;
     /// The meter for the receive pins.
     fn meter(&mut self) -> &mut Self::Meter;
+
+    /// Lets `act` touch what disturbs a bus, too; `None` where nothing can.
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    fn with_disturber<R>(
+        &mut self,
+        _act: impl FnOnce(&mut Disturber, &mut dyn PulseTimer, &mut Capture<'q, N>, &Self::Clock) -> R,
+    ) -> Option<R> {
+        None
+    }
 
     /// Corrects the device's description of itself, where its hardware is not a board's.
     fn describe(&self, _hello: &mut Hello) {}

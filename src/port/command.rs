@@ -1,5 +1,4 @@
-//! Carries out a host's commands. Those that must wait for a controller become [`Work`], which each
-//! poll advances; nothing here blocks.
+//! Carries out a host's commands. Those that must wait for a controller become [`Work`], which each poll advances; nothing here blocks.
 
 use cantap_wire::message::{ChannelConfig, Defaults, Filter, MAX_FILTERS, Status, capability};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
@@ -27,11 +26,9 @@ use settings::{
     ChannelSettings, MAX_SETTINGS, add_reports, load_gateway, saved, saved_reports, store, store_gateway,
 };
 
-/// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After this long the
-/// bus is stuck, and the controller is made to leave.
+/// A controller leaves the bus when its frame has ended: 160 bits at 5 kbit/s are 32 ms. After this long it is stuck, and made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
-/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, checks every 10 ms). If it takes
-/// longer than this, it has no clock or is broken.
+/// A controller that is made to leave takes a moment (Linux's `drivers/net/can/bxcan.c` checks every 10 ms). After this it is broken.
 const HALT_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// A frame is released from a FIFO within a few clocks. After this long it is not, and the controller's reset is to empty the FIFO.
 const RELEASE_WITHIN_TICKS: u32 = 2 * TICKS_PER_MS;
@@ -214,6 +211,10 @@ impl Commands {
             Command::StopGateway => gateway::stop(board),
             Command::GatewayStatus { from, first } => gateway::status(from, first, board),
             Command::SaveGateway => store_gateway(&self.settings, board)?,
+            #[cfg(any(feature = "disturb", not(target_os = "none")))]
+            Command::UnlockDisturbance { word } => disturb::unlock(word, board)?,
+            #[cfg(any(feature = "disturb", not(target_os = "none")))]
+            Command::Disturb { channel, at_ticks, bits } => disturb::plan(channel, at_ticks, bits, board)?,
         };
         Ok(Step::Done(reply))
     }
@@ -223,6 +224,8 @@ impl Commands {
         self.begun = board.now();
         self.emptying = [Emptying::No; CHANNELS];
         self.end_measurement(work, board);
+        #[cfg(any(feature = "disturb", not(target_os = "none")))]
+        disturb::end(work, board);
         match work {
             // A restart in the middle of a frame would destroy it for everyone on the bus.
             Work::Silence | Work::Restart | Work::Bootloader => {
@@ -369,8 +372,7 @@ impl Commands {
         })
     }
 
-    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed an unknown
-    /// number of frames.
+    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed frames.
     fn restore_filters<'q, const N: usize>(&self, channel: Channel, board: &mut impl Board<'q, N>) {
         if !board.filters().write(&self.layout) {
             return;
@@ -415,9 +417,8 @@ impl Commands {
         None
     }
 
-    /// A channel that has left the bus still has frames in its FIFO, which would turn up in the next session. After a while the
-    /// controller's own reset, which empties it (RM0090, CAN_MCR, RESET), is requested, and if `told`, what it holds is recorded as
-    /// lost. [`Self::leave`] sees the reset through. Returns whether even that has not helped in time.
+    /// A channel that has left the bus still has frames in its FIFO. After a while the controller's own reset, which empties it (RM0090, CAN_MCR,
+    /// RESET), is requested, and if `told`, what it holds is recorded as lost. Returns whether even that has not helped in time.
     fn empty<'q, const N: usize>(
         &mut self,
         channel: Channel,
@@ -604,8 +605,7 @@ impl Commands {
         saved_reports(board)
     }
 
-    /// Stores each configured channel's settings, keeping what is stored for the other, and, if given, whether slcan's reports
-    /// are wanted.
+    /// Stores each configured channel's settings, keeping what is stored for the other, and, if given, whether slcan reports.
     #[inline(never)]
     pub fn save<'q, const N: usize>(
         &self,
@@ -667,3 +667,6 @@ fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, 
         capture.begin_close(channel, traffic, clock);
     });
 }
+
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+mod disturb;

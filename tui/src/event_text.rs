@@ -15,6 +15,7 @@ pub fn event_text(event: &TraceEvent) -> String {
         TraceEvent::State { .. } => 'S',
         TraceEvent::Lost { .. } => 'L',
         TraceEvent::TransmitFailed { .. } => 'F',
+        TraceEvent::Disturbed { .. } => 'D',
     };
     format!("{letter} {event}")
 }

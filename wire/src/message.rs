@@ -8,6 +8,8 @@ use crate::{CHANNELS, Channel};
 
 mod bytes;
 mod channel;
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+mod disturbance;
 mod edges;
 mod gateway;
 mod sharing;
@@ -16,6 +18,10 @@ mod transmission;
 
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
+#[cfg(any(feature = "disturb", not(target_os = "none")))]
+pub use disturbance::{
+    DISTURBANCE_LEAD_TICKS, DISTURBANCE_PAUSE_TICKS, DISTURBANCE_WORD, MAX_DISTURBANCE_BITS,
+};
 pub use edges::{Edge, Edges, MAX_EDGES};
 pub use gateway::{
     GATEWAY_TAG, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, MAX_GATEWAY_RULES, MAX_RULE_COUNTS,
@@ -250,6 +256,23 @@ pub enum Command {
         /// In this order.
         frames: Vec<TxFdFrame, MAX_SEND_FD>,
     },
+    /// Permits [`Command::Disturb`] until the session ends: see [`capability::DISTURB`].
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    UnlockDisturbance {
+        /// [`DISTURBANCE_WORD`].
+        word: u32,
+    },
+    /// Drives the bus dominant for a while, so that an error frame arises. The channel must be open in normal mode. There is one
+    /// disturbance at a time, and at most one in [`DISTURBANCE_PAUSE_TICKS`]; each is recorded as [`crate::Event::Disturbed`].
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    Disturb {
+        /// Where.
+        channel: Channel,
+        /// Device time at which the level begins: at least [`DISTURBANCE_LEAD_TICKS`] ahead.
+        at_ticks: u64,
+        /// For how many bits of the channel's bit rate: 1 to [`MAX_DISTURBANCE_BITS`].
+        bits: u8,
+    },
 }
 
 /// A value that answers a request.
@@ -368,10 +391,19 @@ pub enum Refusal {
     OtherSettings,
     /// Never from a device: the server has no board at the moment.
     NoBoard,
-    /// A gateway needs both channels in [`Mode::Normal`].
+    /// A gateway needs both channels in [`Mode::Normal`], and a disturbance needs its own.
     NotNormal,
     /// The gateway must be stopped first.
     GatewayRunning,
+    /// [`Command::UnlockDisturbance`], with its word, must come first.
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    DisturbanceLocked,
+    /// A disturbance is already planned, or the last one was too short a time before.
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    TooOften,
+    /// The target time has passed, or is too near.
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    TooLate,
 }
 
 /// What a device is. The first field's encoding never changes between versions.
@@ -411,6 +443,11 @@ impl Hello {
         self.capabilities & capability::FD_TRANSMIT != 0
     }
 
+    /// Whether it disturbs a bus on purpose.
+    pub const fn disturbs(&self) -> bool {
+        self.capabilities & capability::DISTURB != 0
+    }
+
     /// Whether every loss is counted by somebody, if only as "at least one".
     pub const fn counts_losses(&self) -> bool {
         self.capabilities & capability::UNCOUNTED_LOSSES == 0
@@ -443,4 +480,6 @@ pub mod capability {
     pub const GATEWAY: u32 = 1 << 10;
     /// Never of a board of ours: can transmit CAN FD frames.
     pub const FD_TRANSMIT: u32 = 1 << 11;
+    /// Disturbs a bus on purpose, on those channels whose TX pin has a timer. Never of a released build.
+    pub const DISTURB: u32 = 1 << 12;
 }

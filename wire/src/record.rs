@@ -1,6 +1,4 @@
-//! Records: what a device saw or did, in the order of its capture queue.
-//!
-//! A record begins with a byte that gives its kind:
+//! Records: what a device saw or did, in the order of its capture queue. Each begins with a byte that gives its kind:
 //!
 //! | first byte | then |
 //! |---|---|
@@ -10,9 +8,8 @@
 //! | `0x60..=0x7F` | a received CAN FD frame: bits 2..0 as above, bit 3 its bit rate is switched, bit 4 its sender is error passive; then as below, without remote frames, with up to 64 bytes of data. Never from a board |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
-//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the previous record. They are signed because
-//! a stamp may be computed back to a time before the other channel's last one, and wide because nothing bounds the time
-//! between two records: a host may open a channel hours after its greeting, or read nothing for hours.
+//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the previous record. They are signed because a stamp may be
+//! before the other channel's last one, and wide because a host may open a channel hours after its greeting, or read nothing for hours.
 
 pub use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use serde::{Deserialize, Serialize};
@@ -30,8 +27,7 @@ use parts::{FRAME, MAX_TICKS, NO_DATA, NO_STAMP, UPPER_BOUND, decode_ticks, enco
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
 pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + MAX_TICKS + 8;
-/// Bytes of the longest record of any kind: an [`Event::Transmitted`] with eight data bytes, which is
-/// index, channel, tag, packed ID, DLC, length, data and time difference.
+/// Bytes of the longest record of any kind, an [`Event::Transmitted`]: index, channel, tag, packed ID, DLC, length, data, time difference.
 pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + MAX_TICKS;
 /// The index of [`Event::Transmitted`].
 const TRANSMITTED: u8 = 6;
@@ -50,8 +46,7 @@ pub struct Received {
     pub data_omitted: bool,
 }
 
-/// Everything in the stream that is not a received frame. The order of the variants is the wire
-/// format: append only, and at most 64.
+/// Everything in the stream that is not a received frame. The order of the variants is the wire format: append only, and at most 64.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Event {
     /// Frames are missing at this place.
@@ -108,8 +103,7 @@ pub enum Event {
     Transmitted {
         /// Where.
         channel: Channel,
-        /// The tag from the request (see [`crate::message::TxFrame`]); for frames that the device
-        /// sends on its own, see [`crate::message::DEVICE_TAG`].
+        /// The tag from the request ([`crate::message::TxFrame`]), or of what the device sends on its own ([`crate::message::DEVICE_TAG`]).
         tag: u32,
         /// The frame as sent.
         #[serde(with = "crate::packed")]
@@ -124,15 +118,21 @@ pub enum Event {
         /// Why.
         reason: TransmitFailure,
     },
-    /// The start of a USB frame. The record's time is the stamp timer as the hardware latched it when the
-    /// frame's SOF token had been received: device ticks against the clock of the host's USB controller.
-    /// About once a second in a session, whether a channel is open or not; none where no SOF was latched.
+    /// The start of a USB frame. The record's time is the stamp timer as the hardware latched it when the frame's SOF token had been
+    /// received. About once a second in a session, whether a channel is open or not; none where no SOF was latched.
     SofMark {
         /// The frame number in that token: 11 bits, one more each millisecond, 0 after 2047.
         frame: u16,
-        /// Milliseconds since the last mark in which more than one SOF was latched. Near 1000 if a host
-        /// or chip doubles each SOF; then half of the latched times are not the start of a frame.
+        /// Milliseconds since the last mark in which more than one SOF was latched: near 1000 if a host or chip doubles each.
         doubled: u16,
+    },
+    /// The device has driven the bus dominant, as asked. The record's time is when the level began, or was to begin.
+    #[cfg(any(feature = "disturb", not(target_os = "none")))]
+    Disturbed {
+        /// Where.
+        channel: Channel,
+        /// For how many ticks; 0 if it came to nothing, because the device was busy at that moment.
+        ticks: u16,
     },
 }
 

@@ -29,6 +29,11 @@ impl Board {
         }
     }
 
+    /// The firmware with the feature `disturb`, which is never released.
+    pub fn disturbing_elf(self) -> PathBuf {
+        workspace::firmware_dir().join(format!("cantap-{}-disturb.elf", self.name()))
+    }
+
     /// The finished firmware.
     pub fn elf(self) -> PathBuf {
         workspace::firmware_dir().join(format!("cantap-{}.elf", self.name()))

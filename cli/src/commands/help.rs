@@ -42,7 +42,10 @@ const GROUPS: [(&str, &[&str]); 7] = [
             "timing",
         ],
     ),
-    ("Send, ask", &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939", "gateway"]),
+    (
+        "Send, ask",
+        &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939", "gateway", "disturb"],
+    ),
     (
         "Devices",
         &[

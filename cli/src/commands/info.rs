@@ -23,7 +23,7 @@ pub struct Args {
 }
 
 /// Names of the device's capabilities.
-const CAPABILITIES: [(u32, &str); 12] = [
+const CAPABILITIES: [(u32, &str); 13] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
@@ -36,6 +36,7 @@ const CAPABILITIES: [(u32, &str); 12] = [
     (capability::NO_BIT_RATE, "no-bit-rate"),
     (capability::UNCOUNTED_LOSSES, "uncounted-losses"),
     (capability::FD_TRANSMIT, "fd-transmit"),
+    (capability::DISTURB, "disturb"),
 ];
 
 /// Runs it.

@@ -17,6 +17,7 @@ pub mod decode;
 pub mod defaults;
 pub mod delay;
 pub mod diff;
+pub mod disturb;
 pub mod doctor;
 pub mod extcap;
 pub mod gateway;
@@ -74,6 +75,8 @@ pub enum Command {
     Delay(Box<delay::Args>),
     /// Pass frames on between a device's two buses, as rules say; or try the rules on a trace.
     Gateway(Box<gateway::Args>),
+    /// Destroy frames on purpose, on a test bench, with a board that was built for it.
+    Disturb(Box<disturb::Args>),
     /// Put traces of several recorders on one clock, using the frames that they have in common.
     Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
@@ -164,6 +167,7 @@ impl Command {
             Self::Diff(args) => diff::run(&args),
             Self::Delay(args) => delay::run(*args),
             Self::Gateway(args) => gateway::run(&args),
+            Self::Disturb(args) => disturb::run(&args),
             Self::Align(args) => align::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),

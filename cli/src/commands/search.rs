@@ -297,5 +297,6 @@ fn describe(event: &TraceEvent) -> String {
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
         TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),
+        TraceEvent::Disturbed { .. } => event.to_string(),
     }
 }

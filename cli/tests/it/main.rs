@@ -26,6 +26,7 @@ mod decode;
 mod defaults;
 mod device_care;
 mod diagnostics;
+mod disturb;
 mod doctor;
 mod emulated;
 mod emulated_autobaud;

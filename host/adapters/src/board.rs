@@ -287,7 +287,9 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
             | Command::MeasureEdges { .. }
             | Command::SetGatewayRule { .. }
             | Command::StartGateway
-            | Command::SaveGateway => Err(Refusal::Unsupported),
+            | Command::SaveGateway
+            | Command::UnlockDisturbance { .. }
+            | Command::Disturb { .. } => Err(Refusal::Unsupported),
             Command::Identify { seconds } => self.driver.identify(*seconds),
             // What the firmware refuses anyway must not reach the adapter.
             Command::Open { channel, config: Some(config) }

@@ -290,7 +290,7 @@ impl Incoming {
             TraceEvent::Lost { stage, count, at_least } => {
                 Self::Lost { channel, stage: stage.unwrap_or(LossStage::Link), count, at_least, at }
             }
-            TraceEvent::TransmitFailed { .. } => return None,
+            TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => return None,
         })
     }
 }

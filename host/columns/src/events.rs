@@ -19,8 +19,9 @@ pub const BUS_ERROR: &str = "bus-error";
 pub const SUPPRESSED: &str = "errors-suppressed";
 pub const STATE: &str = "state";
 pub const TRANSMIT_FAILED: &str = "transmit-failed";
+pub const DISTURBED: &str = "disturbed";
 /// Their order in the column of events, after the table's own.
-const KINDS: [&str; 5] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED];
+const KINDS: [&str; 6] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED, DISTURBED];
 
 /// The columns' names and types.
 pub fn fields() -> Vec<Field> {
@@ -194,6 +195,9 @@ impl Happened {
                 };
                 let (detail, tag) = (Some(reason.name()), Some(tag));
                 Self { event: kind(TRANSMIT_FAILED), detail, count, tag, ..Self::default() }
+            }
+            TraceEvent::Disturbed { length_ns } => {
+                Self { event: kind(DISTURBED), count: Some(length_ns), ..Self::default() }
             }
         }
     }

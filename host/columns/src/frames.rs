@@ -22,7 +22,7 @@ pub const TX: &str = "tx";
 /// |---|---|---|
 /// | `time` | timestamp\[ns, UTC\] | every row; since 1970, or since the trace's start where no date is known |
 /// | `channel` | uint8, as the trace counts them: from 1 in most formats, from 0 in some | every row |
-/// | `event` | text: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed` | every row |
+/// | `event` | text: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`, `disturbed` | every row |
 /// | `detail` | text: where frames were lost, which error, which state, why not sent | events that say it |
 /// | `count` | uint32: frames lost, errors suppressed, periods overtaken | these |
 /// | `at_least` | bool: there may have been more | losses |

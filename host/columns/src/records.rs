@@ -12,7 +12,7 @@ use cantap_trace::{
 };
 
 use crate::bad::BadColumns;
-use crate::events::{BUS_ERROR, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
+use crate::events::{BUS_ERROR, DISTURBED, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
 use crate::foreign::with_our_columns;
 use crate::frames::{FRAME, RX, TX};
 use crate::signals::VALUE;
@@ -193,6 +193,7 @@ impl<'a> Columns<'a> {
                 });
                 TraceEvent::TransmitFailed { tag, reason: reason.ok_or("its detail is not a known failure")? }
             }
+            DISTURBED => TraceEvent::Disturbed { length_ns: count.unwrap_or(0) },
             VALUE => return Err("it is a decoded value; records are what `read` gives without a database"),
             _ => return Err("its event is not of a known kind"),
         };

@@ -1,6 +1,6 @@
 //! Events as words, for formats that allow comments but have no form for these events: `lost 5+
 //! queue`, `bus-error stuff tec=8 rec=0`, `state passive`, `errors-suppressed 17`,
-//! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`.
+//! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`, `disturbed 6000` (ns).
 
 use std::fmt;
 use std::str::FromStr;
@@ -38,6 +38,7 @@ impl fmt::Display for EventText {
                     write!(f, " periods={periods}")?;
                 }
             }
+            TraceEvent::Disturbed { length_ns } => write!(f, "disturbed {length_ns}")?,
         }
         if let TraceEvent::BusError { counters: Some((tec, rec)), .. }
         | TraceEvent::State { counters: Some((tec, rec)), .. } = &self.0
@@ -99,6 +100,9 @@ fn parse(text: &str) -> Option<TraceEvent> {
         }
         ("transmit-failed", [Some(reason), None]) => {
             TraceEvent::TransmitFailed { tag: tag?, reason: TransmitFailure::from_name(reason, periods)? }
+        }
+        ("disturbed", [Some(length_ns), None]) => {
+            TraceEvent::Disturbed { length_ns: length_ns.parse().ok()? }
         }
         _ => return None,
     })

@@ -413,7 +413,9 @@ impl Client {
             | Command::StopGateway
             | Command::GatewayStatus { .. }
             | Command::GatewayRule { .. }
-            | Command::SaveGateway => Err(Refusal::Unsupported),
+            | Command::SaveGateway
+            | Command::UnlockDisturbance { .. }
+            | Command::Disturb { .. } => Err(Refusal::Unsupported),
         }
     }
 

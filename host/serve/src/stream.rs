@@ -92,6 +92,7 @@ pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
                     | Event::BusError { channel, .. }
                     | Event::ErrorsSuppressed { channel, .. }
                     | Event::State { channel, .. }
+                    | Event::Disturbed { channel, .. }
                     // The end of a gap.
                     | Event::Started { channel } => is_open(channel).then_some(event),
                     // Each client's channels stop on their own.
@@ -184,7 +185,10 @@ impl Gap {
                     self.lost[channel.index()] += 1;
                     return Some(channel);
                 }
-                Event::TransmitFailed { .. } | Event::Lost { .. } | Event::State { .. } => {
+                Event::TransmitFailed { .. }
+                | Event::Lost { .. }
+                | Event::State { .. }
+                | Event::Disturbed { .. } => {
                     self.keep(ticks, event);
                 }
                 Event::BusError { channel, .. } => self.errors[channel.index()] += 1,

@@ -1,8 +1,8 @@
 //! The requests to a device, one method each.
 
 use cantap_wire::message::{
-    ChannelConfig, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic, Registers,
-    Status, Trigger, TxFdFrame, TxFrame,
+    ChannelConfig, DISTURBANCE_WORD, Defaults, Edges, Failures, Filter, GatewayRule, GatewayStatus, Periodic,
+    Registers, Status, Trigger, TxFdFrame, TxFrame,
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
@@ -152,6 +152,17 @@ impl Device {
     /// runs the gateway on its own. Both channels must be closed, and configured for normal mode.
     pub fn save_gateway(&self) -> Result<(), DeviceError> {
         self.done(Command::SaveGateway)
+    }
+
+    /// Permits [`Self::disturb`] until the session ends. Only a board built for it does ([`Hello::disturbs`](cantap_wire::Hello::disturbs)).
+    pub fn unlock_disturbances(&self) -> Result<(), DeviceError> {
+        self.done(Command::UnlockDisturbance { word: DISTURBANCE_WORD })
+    }
+
+    /// Drives a bus dominant for this many bits (1 to 12) from the device time `at_ticks` on, so that an error frame arises. The channel must
+    /// be open in normal mode. Recorded as [`TraceEvent::Disturbed`](crate::TraceEvent::Disturbed); at most one in 10 ms.
+    pub fn disturb(&self, channel: Channel, at_ticks: u64, bits: u8) -> Result<(), DeviceError> {
+        self.done(Command::Disturb { channel, at_ticks, bits })
     }
 
     /// The controller's registers.

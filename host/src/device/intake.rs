@@ -522,6 +522,9 @@ fn on_event(
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Err(reason) }));
             (channel, TraceEvent::TransmitFailed { tag, reason })
         }
+        Event::Disturbed { channel, ticks } => {
+            (channel, TraceEvent::Disturbed { length_ns: clock.nominal_ns(ticks.into()) })
+        }
         Event::Stopped { channel } => return notice(Notice::Stopped(channel)),
         Event::SofMark { frame, doubled } => {
             return clock.mark(SofMark { frame, at, doubled });

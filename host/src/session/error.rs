@@ -334,7 +334,12 @@ fn sentence(refusal: Refusal) -> String {
         Refusal::OtherSettings => {
             "other clients of its server have the channel open, with another bit rate or mode; open it as they have"
         }
-        Refusal::NotNormal => "a gateway needs both channels in normal mode; open them so",
+        Refusal::NotNormal => {
+            "a gateway needs both channels in normal mode, and a disturbance needs its own; open them so"
+        }
+        Refusal::DisturbanceLocked => "disturbances are not unlocked in this session",
+        Refusal::TooOften => "a disturbance is already planned, or the last one was less than 10 ms before",
+        Refusal::TooLate => "the time has passed, or is less than 1 ms ahead",
         Refusal::GatewayRunning => "its gateway is running; stop it first",
         Refusal::NoBoard => "its server has no board at the moment; connect the board to it again",
     };

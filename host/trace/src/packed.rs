@@ -17,6 +17,7 @@ const SUPPRESSED: u8 = 3;
 const STATE: u8 = 4;
 const LOST: u8 = 5;
 const TRANSMIT_FAILED: u8 = 6;
+const DISTURBED: u8 = 7;
 /// And the three after it: bit rate switched, sender passive.
 const FD: u8 = 8;
 const FD_BRS: u8 = 1;
@@ -104,6 +105,10 @@ fn write_one(record: &TraceRecord, before_ns: i64, out: &mut Vec<u8>) {
             };
             out.push(place(&TransmitFailure::ALL, Some(kind)));
             varint(periods.into(), out);
+        }
+        TraceEvent::Disturbed { length_ns } => {
+            begin(out, DISTURBED);
+            varint(length_ns.into(), out);
         }
     }
 }
@@ -229,7 +234,7 @@ impl<'a> Rest<'a> {
                 };
                 TraceEvent::TransmitFailed { tag, reason }
             }
-            _ => return None,
+            DISTURBED => TraceEvent::Disturbed { length_ns: self.u32()? },
         };
         Some(TraceRecord { time_ns, channel, event })
     }

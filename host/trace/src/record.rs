@@ -74,6 +74,11 @@ pub enum TraceEvent {
         /// The reason.
         reason: TransmitFailure,
     },
+    /// The device drove the bus dominant on purpose, as asked. The record's time is when that began, or was to begin.
+    Disturbed {
+        /// For how many nanoseconds; 0 if it came to nothing, because the device was busy at that moment.
+        length_ns: u32,
+    },
 }
 
 impl TraceEvent {

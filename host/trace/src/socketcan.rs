@@ -45,6 +45,7 @@ const AT_ACK: u8 = 0x19;
 // status.
 const AT_LEAST: u8 = 0x80;
 const SUPPRESSED: u8 = 0x40;
+const DISTURBED: u8 = 0x20;
 
 const STAGES: [LossStage; 5] = LossStage::ALL;
 const FAILURES: [TransmitFailure; 5] = [
@@ -106,6 +107,11 @@ impl ErrorFrame {
             TraceEvent::ErrorsSuppressed { count } => {
                 data[0] = SUPPRESSED;
                 data[2..6].copy_from_slice(&count.to_le_bytes());
+                BUS_ERROR
+            }
+            TraceEvent::Disturbed { length_ns } => {
+                data[0] = DISTURBED;
+                data[2..6].copy_from_slice(&length_ns.to_le_bytes());
                 BUS_ERROR
             }
             TraceEvent::State { state, .. } => {
@@ -193,6 +199,9 @@ impl ErrorFrame {
         }
         if has(BUS_ERROR) && !has(PROTOCOL | NO_ACK | LOST_ARBITRATION) && data[0] == SUPPRESSED {
             return (TraceEvent::ErrorsSuppressed { count: number }, None);
+        }
+        if classes == BUS_ERROR && data[0] == DISTURBED {
+            return (TraceEvent::Disturbed { length_ns: number }, None);
         }
         (bus_error, None)
     }

@@ -51,6 +51,7 @@ pub fn event() -> impl Strategy<Value = TraceEvent> {
         (any::<u32>(), prop::sample::select(reasons.collect::<Vec<_>>()))
             .prop_map(|(tag, reason)| TraceEvent::TransmitFailed { tag, reason }),
         overtaken,
+        any::<u32>().prop_map(|length_ns| TraceEvent::Disturbed { length_ns }),
     ]
 }
 

@@ -114,7 +114,7 @@ impl Meter {
             }
             TraceEvent::BusError { .. } => self.bus_errors += 1,
             TraceEvent::ErrorsSuppressed { count } => self.bus_errors += u64::from(*count),
-            TraceEvent::State { .. } | TraceEvent::TransmitFailed { .. } => {}
+            TraceEvent::State { .. } | TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => {}
         }
     }
 

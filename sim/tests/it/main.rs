@@ -10,6 +10,7 @@ mod common;
 mod controller_reset;
 mod conversation;
 mod disruption;
+mod disturb;
 mod full_load;
 mod gateway;
 mod hostile;

@@ -17,6 +17,7 @@ enum What {
     State { state: ErrorState, counters: Option<(u8, u8)> },
     Lost { stage: Option<LossStage>, count: u32, at_least: bool },
     TransmitFailed { tag: u32, reason: TransmitFailure },
+    Disturbed { length_ns: u32 },
     Fd(u32),
 }
 
@@ -34,6 +35,7 @@ impl Kept {
             TraceEvent::State { state, counters } => What::State { state, counters },
             TraceEvent::Lost { stage, count, at_least } => What::Lost { stage, count, at_least },
             TraceEvent::TransmitFailed { tag, reason } => What::TransmitFailed { tag, reason },
+            TraceEvent::Disturbed { length_ns } => What::Disturbed { length_ns },
         };
         Self { time_ns: record.time_ns, channel: record.channel, what }
     }
@@ -56,6 +58,7 @@ impl Kept {
                 TraceEvent::Lost { stage: *stage, count: *count, at_least: *at_least }
             }
             What::TransmitFailed { tag, reason } => TraceEvent::TransmitFailed { tag: *tag, reason: *reason },
+            What::Disturbed { length_ns } => TraceEvent::Disturbed { length_ns: *length_ns },
             What::Fd(number) => elsewhere(*number)?,
         };
         Some(TraceRecord { time_ns: self.time_ns, channel: self.channel, event })

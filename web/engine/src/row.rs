@@ -68,7 +68,7 @@ fn kind(event: &TraceEvent) -> &'static str {
         TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. } => "error",
         TraceEvent::State { .. } => "state",
         TraceEvent::Lost { .. } => "lost",
-        TraceEvent::TransmitFailed { .. } => "other",
+        TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => "other",
     }
 }
 

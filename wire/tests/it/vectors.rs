@@ -109,6 +109,7 @@ fn event_reads(event: &Event) -> String {
             };
             format!("{} not-sent tag {tag} {}{periods}", channel_name(*channel), hyphenated(reason))
         }
+        Event::Disturbed { channel, ticks } => format!("{} disturbed {ticks}", channel_name(*channel)),
         Event::SofMark { frame, doubled } => format!("sof {frame} doubled {doubled}"),
     }
 }

@@ -215,6 +215,7 @@ impl ChannelStatistics {
                     _ => 1,
                 };
             }
+            TraceEvent::Disturbed { .. } => {}
         }
     }
 

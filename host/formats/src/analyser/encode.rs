@@ -88,7 +88,8 @@ impl RowEncoder {
             }
             TraceEvent::State { .. }
             | TraceEvent::ErrorsSuppressed { .. }
-            | TraceEvent::TransmitFailed { .. } => {
+            | TraceEvent::TransmitFailed { .. }
+            | TraceEvent::Disturbed { .. } => {
                 left_out.note("changes of state and other events, which the analyser's table has no row for");
                 return None;
             }

@@ -94,7 +94,8 @@ impl Learner {
             TraceEvent::BusError { .. } => return self.leave_out("errors on the bus"),
             TraceEvent::ErrorsSuppressed { .. }
             | TraceEvent::State { .. }
-            | TraceEvent::TransmitFailed { .. } => {
+            | TraceEvent::TransmitFailed { .. }
+            | TraceEvent::Disturbed { .. } => {
                 return self.leave_out("other events");
             }
         };

@@ -152,6 +152,11 @@ impl ClockMap {
         self.push(Bend { at, utc: last.utc(at), ns_per_tick: self.nominal_ns_per_tick, ..last });
     }
 
+    /// The length of so many ticks, in nanoseconds of the device's crystal.
+    pub fn nominal_ns(&self, ticks: u64) -> u32 {
+        (ticks as f64 * self.nominal_ns_per_tick) as u32
+    }
+
     /// The UTC time of a device time. A past time keeps the UTC it had then, for the last 17 minutes.
     #[inline]
     pub fn utc(&self, ticks: Ticks) -> UtcNs {

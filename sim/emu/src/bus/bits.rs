@@ -70,6 +70,11 @@ impl FrameBits {
         self.stuff.iter().filter(|stuff| **stuff).count()
     }
 
+    /// Whether a bit is a stuff bit.
+    pub(super) fn is_stuff(&self, index: usize) -> bool {
+        self.stuff.get(index) == Some(&true)
+    }
+
     /// Index of the first bit after the arbitration field (ID and RTR, with SRR and IDE between).
     pub fn arbitration_end(&self) -> usize {
         self.arbitration_end

@@ -6,6 +6,7 @@
 //! (the second waits).
 
 pub mod bits;
+mod driven;
 pub mod node;
 pub mod outcome;
 pub mod sampling;
@@ -20,9 +21,11 @@ use fastrand::Rng;
 
 use crate::can::fault::ErrorCounters;
 use crate::can::{CanPair, Mode};
+use bits::FrameBits;
+use driven::Outside;
 pub use node::{BitTime, Node, Source};
-use outcome::Detection;
 pub use outcome::Disturbance;
+use outcome::{Detection, Participant};
 pub use waveform::Edge;
 use waveform::Waveform;
 
@@ -71,10 +74,17 @@ enum Step {
 }
 
 struct Flight {
-    sender: Member,
+    /// `None` if nobody sends: a level from outside began it.
+    sender: Option<Member>,
     /// Members that send exactly the same frame at the same time.
     twins: Vec<Member>,
     frame: Frame,
+    bits: Option<FrameBits>,
+    /// Everyone who takes part, the sender first; and what each does.
+    members: Vec<Member>,
+    participants: Vec<Participant>,
+    /// Dominant bits of each that are counted already.
+    driven: Vec<u64>,
     start: u64,
     valid: u64,
     end: u64,
@@ -82,7 +92,7 @@ struct Flight {
     recessive: u64,
     error: Option<BusErrorKind>,
     bit: BitTime,
-    receivers: Vec<usize>,
+    receivers: Vec<Member>,
     taken_by: u8,
     steps: VecDeque<(u64, Step)>,
 }
@@ -104,6 +114,7 @@ pub struct Wire {
     started: u64,
     history: Vec<BusFrame>,
     waveform: Waveform,
+    outside: Outside,
 }
 
 /// A bus held dominant: when its listeners count the next error.
@@ -127,6 +138,7 @@ impl Wire {
             started: 0,
             history: Vec::new(),
             waveform: Waveform::default(),
+            outside: Outside::default(),
         }
     }
 
@@ -208,6 +220,36 @@ impl Wire {
             for n in &self.attached {
                 can.controllers[*n].bus_free();
             }
+        }
+    }
+
+    /// Something other than the controllers and nodes drives the bus dominant from cycle `at` on, or no longer does. Unlike
+    /// [`Self::hold_dominant`] it becomes part of the frame under way, bit by bit; on an idle bus it is a start of frame.
+    pub fn drive(&mut self, dominant: bool, at: u64, can: &mut CanPair) {
+        if !self.outside.drive(dominant, at) {
+            return;
+        }
+        if self.stuck.is_some() {
+            self.hold_dominant(dominant, can);
+        } else if self.flight.is_some() {
+            self.replan(can);
+        } else if dominant {
+            self.start_driven(at, can);
+        } else {
+            self.outside.forget_past();
+        }
+    }
+
+    /// A controller's pin is connected to something else from cycle `at` on, or to the controller again: what it sends does not
+    /// reach the bus meanwhile, and it still hears everything.
+    pub fn cut(&mut self, controller: usize, cut: bool, at: u64, can: &mut CanPair) {
+        if !self.outside.cut(controller, cut, at) {
+            return;
+        }
+        if self.flight.is_some() {
+            self.replan(can);
+        } else {
+            self.outside.forget_past();
         }
     }
 
@@ -317,10 +359,14 @@ impl Wire {
             Step::LoseArbitration(Member::Node(_)) => {}
             Step::Error(member, sends, detection) => self.error(member, sends, detection, can),
             Step::Receive => {
-                for n in flight.receivers.clone() {
-                    if can.controllers[n].listens() {
-                        flight.taken_by |= 1 << n;
-                        can.receive(n, &flight.frame);
+                for member in flight.receivers.clone() {
+                    match member {
+                        Member::Controller(n) if can.controllers[n].listens() => {
+                            flight.taken_by |= 1 << n;
+                            can.receive(n, &flight.frame);
+                        }
+                        Member::Controller(_) => {}
+                        Member::Node(n) => self.nodes[n].counters.received(),
                     }
                 }
             }
@@ -350,8 +396,9 @@ impl Wire {
 
     fn finish(&mut self, can: &mut CanPair) {
         let Some(flight) = self.flight.take() else { return };
+        self.outside.forget_past();
         if flight.error.is_none() {
-            for member in std::iter::once(flight.sender).chain(flight.twins) {
+            for member in flight.sender.into_iter().chain(flight.twins) {
                 match member {
                     Member::Controller(n) => can.controllers[n].sent(),
                     Member::Node(n) => self.nodes[n].frame_sent(),
@@ -363,23 +410,27 @@ impl Wire {
         }
         self.free = flight.free;
         self.recessive = flight.recessive;
-        if let Member::Node(n) = flight.sender
+        if let Some(Member::Node(n)) = flight.sender
             && self.nodes[n].counters.passive()
         {
             let pause = flight.free + flight.bit.cycles(SUSPEND_BITS);
             self.nodes[n].not_before = self.nodes[n].not_before.max(pause);
         }
-        self.history.push(BusFrame {
-            sender: flight.sender,
+        self.history.extend(flight.sender.map(|sender| BusFrame {
+            sender,
             frame: flight.frame,
             start: flight.start,
             valid: flight.valid,
             end: flight.end,
             error: flight.error,
             taken_by: flight.taken_by,
-        });
+        }));
         for node in &mut self.nodes {
             node.refill();
+        }
+        if self.outside.is_dominant() {
+            // It has lasted for longer than any error.
+            self.hold_dominant(true, can);
         }
     }
 
@@ -394,7 +445,9 @@ impl Wire {
         let sender = flight.sender;
         self.flight = Some(flight);
         let detection = Detection { who: 0, bit: 0, kind: BusErrorKind::BitRecessive, first: true };
-        self.error(sender, true, detection, can);
+        if let Some(sender) = sender {
+            self.error(sender, true, detection, can);
+        }
         self.finish(can);
     }
 

@@ -77,7 +77,7 @@ impl<F: Fn(usize) -> u64> Waveform<'_, F> {
 
 /// A receiver's view of the bits, to the end or to the first error.
 #[derive(Default)]
-struct Parser {
+pub(super) struct Parser {
     /// Destuffed bits up to the CRC's end.
     bits: Vec<bool>,
     run: u32,
@@ -88,7 +88,13 @@ struct Parser {
 }
 
 impl Parser {
-    fn take(&mut self, level: bool) -> Option<Result<(), BusErrorKind>> {
+    /// Whether the next bit is the ACK slot of a frame whose CRC is right.
+    pub(super) fn is_to_acknowledge(&self) -> bool {
+        self.tail == 1 && self.crc_ok
+    }
+
+    /// Takes the next bit, `true` for recessive. Returns how the frame ends, if it does.
+    pub(super) fn take(&mut self, level: bool) -> Option<Result<(), BusErrorKind>> {
         if self.wanted() == Some(self.bits.len()) && (self.run != 5 || self.tail > 0) {
             return self.take_tail(level);
         }

@@ -6,7 +6,7 @@ use cantap_can::Frame;
 
 use super::bits::FrameBits;
 use super::outcome::{self, FrameEnd, Participant};
-use super::{BitTime, Disturbance, Flight, Member, SYNC_BITS, Step, Wire, sampling};
+use super::{BitTime, Disturbance, Flight, Member, SYNC_BITS, Step, Wire, driven, sampling};
 use crate::can::{CanPair, Mode};
 
 /// Those who start a frame at the same moment.
@@ -76,7 +76,7 @@ impl Wire {
             .collect();
         let disturbance = self.take_disturbance();
         let outcome = FrameEnd::of(bits, &participants, disturbance);
-        count_dominant(&contest, &members, &participants, &outcome, can);
+        let driven = count_dominant(&contest, &members, &participants, &outcome, can);
         self.waveform.frame(start, bit, bits, &participants, &outcome);
 
         let at = |bits: usize| start + bit.cycles(bits as u64);
@@ -92,24 +92,22 @@ impl Wire {
         }
         let error = outcome.of_participant(0).map(|detection| detection.kind);
         let good = |who: usize| outcome.of_participant(who).is_none();
-        let takers: Vec<usize> = (0..members.len())
+        let takers: Vec<Member> = (0..members.len())
             .filter(|who| !participants[*who].sender && good(*who))
-            .filter_map(|who| match members[who] {
-                Member::Controller(n) => Some(n),
-                Member::Node(n) => {
-                    self.nodes[n].counters.received();
-                    None
-                }
-            })
+            .map(|who| members[who])
             .collect();
         let finish = if error.is_none() { bits.len() } else { outcome.free_after };
         steps.push((at(bits.valid_after()), Step::Receive));
         steps.push((at(finish), Step::Finish));
         steps.sort_by_key(|(time, _)| *time);
         self.flight = Some(Flight {
-            sender,
+            sender: Some(sender),
             twins: twins.clone(),
             frame,
+            bits: Some(bits.clone()),
+            members,
+            participants,
+            driven,
             start,
             valid: at(bits.valid_after()),
             end: at(bits.len()),
@@ -122,6 +120,98 @@ impl Wire {
             steps: steps.into(),
         });
         self.started += 1;
+        if self.outside.is_active() {
+            self.replan(can);
+        }
+    }
+
+    /// A level from outside, on an idle bus, is a start of frame for all that listen.
+    pub(super) fn start_driven(&mut self, at: u64, can: &mut CanPair) {
+        self.count_recovery(can, at);
+        let members: Vec<Member> = self.members().filter(|member| listens(*member, can)).collect();
+        for member in &members {
+            if let Member::Controller(n) = *member {
+                can.controllers[n].start_of_frame(false, at);
+            }
+        }
+        let part = |member: &Member| {
+            let (acknowledges, flags) = self.abilities(*member, can);
+            Participant { sender: false, acknowledges, flags, own: None }
+        };
+        self.flight = Some(Flight {
+            sender: None,
+            twins: Vec::new(),
+            frame: Frame::data_frame(cantap_can::Id::standard_truncated(0), &[]).expect("no data fits"),
+            bits: None,
+            participants: members.iter().map(part).collect(),
+            driven: vec![0; members.len()],
+            members,
+            start: at,
+            valid: at,
+            end: at,
+            free: at,
+            recessive: at,
+            error: None,
+            bit: self.listener_bit(can),
+            receivers: Vec::new(),
+            taken_by: 0,
+            steps: std::collections::VecDeque::new(),
+        });
+        self.replan(can);
+    }
+
+    /// Works out anew what becomes of the frame under way, after a change of what comes from outside.
+    pub(super) fn replan(&mut self, can: &mut CanPair) {
+        let Some(mut flight) = self.flight.take() else { return };
+        let (start, bit) = (flight.start, flight.bit);
+        let at = |bits: usize| start + bit.cycles(bits as u64);
+        // Three quarters of a bit, where most nodes sample.
+        let sampled = |n: usize| u64::midpoint(at(n), at(n + 1)).midpoint(at(n + 1));
+        let outside = &self.outside;
+        let is_cut = |who: usize, n: usize| match flight.members[who] {
+            Member::Controller(controller) => outside.cuts_at(controller, sampled(n)),
+            Member::Node(_) => false,
+        };
+        let fate = driven::fate(
+            flight.bits.as_ref(),
+            &flight.participants,
+            |n| outside.level_at(sampled(n)),
+            is_cut,
+        );
+        for (who, member) in flight.members.iter().enumerate() {
+            if let Member::Controller(n) = *member {
+                can.controllers[n].drove_instead(flight.driven[who], fate.driven[who]);
+            }
+        }
+        let mut steps: Vec<(u64, Step)> = Vec::new();
+        for (who, lost_at) in &fate.lost {
+            steps.push((at(lost_at + 1), Step::LoseArbitration(flight.members[*who])));
+        }
+        // Those who had lost to the winner before.
+        steps.extend(flight.steps.iter().filter(|(_, step)| matches!(step, Step::LoseArbitration(_))));
+        for (detection, sends) in &fate.errors {
+            let member = flight.members[detection.who];
+            steps.push((at(detection.bit + 1), Step::Error(member, *sends, *detection)));
+        }
+        let error = fate.errors.iter().find(|(detection, _)| detection.who == 0).map(|(one, _)| one.kind);
+        flight.error = if fate.sent { None } else { error.or(Some(BusErrorKind::Stuff)) };
+        let finish = match (&flight.bits, flight.error) {
+            (Some(bits), None) => at(bits.len()),
+            _ => at(fate.free_after),
+        };
+        steps.push((flight.valid, Step::Receive));
+        steps.push((finish.max(self.now + 1), Step::Finish));
+        steps.retain(|(time, _)| *time > self.now);
+        steps.sort_by_key(|(time, _)| *time);
+        flight.steps = steps.into();
+        flight.receivers = fate.takers.iter().map(|who| flight.members[*who]).collect();
+        flight.free = at(fate.free_after);
+        flight.recessive = at(fate.recessive_from);
+        flight.driven.clone_from(&fate.driven);
+        let members = fate.levels.iter().enumerate().filter(|(_, dominant)| **dominant);
+        let members = members.map(|(n, _)| (at(n), Some(at(n + 1))));
+        self.waveform.redraw(self.now, members.chain(self.outside.levels()).collect());
+        self.flight = Some(flight);
     }
 
     /// Who wants to send now, and who wins; `None` if nobody does.
@@ -245,14 +335,15 @@ fn listens(member: Member, can: &CanPair) -> bool {
     }
 }
 
-/// Adds what each emulated controller puts on the bus in this frame.
+/// Adds what each emulated controller puts on the bus in this frame. Returns it for each member.
 fn count_dominant(
     contest: &Contest,
     members: &[Member],
     participants: &[Participant],
     outcome: &FrameEnd,
     can: &mut CanPair,
-) {
+) -> Vec<u64> {
+    let mut counted = vec![0; members.len()];
     for (who, member) in members.iter().enumerate() {
         let Member::Controller(n) = *member else { continue };
         let detection = outcome.of_participant(who);
@@ -265,10 +356,12 @@ fn count_dominant(
         driven += u64::from(outcome.acknowledged_by.contains(&who));
         driven += if detection.is_some() && participants[who].flags { outcome::FLAG as u64 } else { 0 };
         can.controllers[n].drove(driven);
+        counted[who] = driven;
     }
     for (member, lost_at) in &contest.losers {
         if let Member::Controller(n) = *member {
             can.controllers[n].drove(contest.bits.dominant_in(*lost_at));
         }
     }
+    counted
 }

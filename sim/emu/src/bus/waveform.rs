@@ -60,6 +60,31 @@ impl Waveform {
         }
     }
 
+    /// Puts other edges in place of all after `now`: those of these times at which the bus is dominant, in any order. The end of a time
+    /// may be unknown.
+    pub(super) fn redraw(&mut self, now: u64, mut dominant: Vec<(u64, Option<u64>)>) {
+        dominant.sort_unstable();
+        let mut merged: Vec<(u64, Option<u64>)> = Vec::with_capacity(dominant.len());
+        for (from, to) in dominant {
+            match merged.last_mut() {
+                Some((_, end)) if end.is_none_or(|end| from <= end) => {
+                    *end = end.and_then(|end| to.map(|to| to.max(end)));
+                }
+                _ => merged.push((from, to)),
+            }
+        }
+        let is_dominant = merged.iter().any(|(from, to)| *from <= now && to.is_none_or(|to| to > now));
+        self.hold(now, is_dominant);
+        for (from, to) in merged {
+            if from > now {
+                self.push(from, true);
+            }
+            if let Some(to) = to.filter(|to| *to > now) {
+                self.push(to + self.slow_recessive, false);
+            }
+        }
+    }
+
     fn push(&mut self, at: u64, dominant: bool) {
         if dominant != self.edges.back().map_or(self.dominant, |edge| edge.dominant) {
             self.edges.push_back(Edge { at, dominant });

@@ -12,6 +12,7 @@ use crate::cpu::Bus;
 use crate::memory_map as map;
 use crate::timing::Speeds;
 
+const TIM4_BASE: u32 = 0x4000_0800;
 const CAN1_BASE: u32 = 0x4000_6400;
 const GPIO_BASE: u32 = 0x4002_0000;
 /// A peripheral's registers are in a block of this size, or a multiple.
@@ -88,6 +89,12 @@ impl Board {
     fn read_register(&mut self, address: u32, now: u64) -> Option<u32> {
         let offset = address % BLOCK;
         match address - offset {
+            TIM4_BASE => {
+                self.advance_buses(now);
+                let value = self.timers[block(address, 0x4000_0000)].read(offset, now);
+                self.follow_driven_pins(now);
+                value
+            }
             0x4000_0000..=0x4000_1400 => self.timers[block(address, 0x4000_0000)].read(offset, now),
             0x4000_3000 => self.watchdog.read(offset),
             CAN1_BASE | 0x4000_6800 => {
@@ -167,7 +174,12 @@ impl Board {
     fn write_register(&mut self, address: u32, value: u32, now: u64) -> Option<()> {
         let offset = address % BLOCK;
         match address - offset {
-            0x4000_0000..=0x4000_1400 => self.timers[block(address, 0x4000_0000)].write(offset, value, now),
+            0x4000_0000..=0x4000_1400 => {
+                let done = self.timers[block(address, 0x4000_0000)].write(offset, value, now);
+                self.advance_buses(now);
+                self.follow_driven_pins(now);
+                done
+            }
             0x4000_3000 => self.watchdog.write(offset, value, now),
             CAN1_BASE | 0x4000_6800 => {
                 self.advance_buses(now);
@@ -187,6 +199,8 @@ impl Board {
                 let port = &mut self.ports[block(address, GPIO_BASE)];
                 let done = port.write(offset, value);
                 self.follow_transmit_pins();
+                self.advance_buses(now);
+                self.follow_driven_pins(now);
                 done
             }
             0x4002_3000 => self.crc.write(offset, value),
@@ -201,6 +215,7 @@ impl Board {
                     self.reset_peripherals(offset, value, now);
                 }
                 self.follow_transmit_pins();
+                self.follow_driven_pins(now);
                 Some(())
             }
             0x4002_3C00 => {

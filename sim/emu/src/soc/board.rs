@@ -10,7 +10,7 @@ use super::odd::{OddAccess, Oddity};
 use super::rcc::{Crystal, Rcc, ResetCause};
 use super::small::{Adc, Crc, Gpio, Storage, Watchdog};
 use super::timer::Timer;
-use super::transmit_pins::TransmitPins;
+use super::transmit_pins::{self, Driven, TransmitPins};
 use crate::bus::Wire;
 use crate::can::CanPair;
 use crate::cpu::Memories;
@@ -28,7 +28,11 @@ pub const RECEIVE_PINS: [(usize, u32); 2] = [(1, 8), (1, 12)];
 /// Interrupt numbers of CAN1 and CAN2: transmit, FIFO 0, FIFO 1, status change and error.
 pub const CAN_IRQS: [[u16; 4]; 2] = [[19, 20, 21, 22], [63, 64, 65, 66]];
 
-/// The one trigger output that is wired: OTG_FS's start of frame, as TIM2_OR.ITR1_RMP has it (RM0090, TIM2_OR).
+/// TIM2 and TIM4 in [`TIMERS`], and TIM2's number among TIM4's internal triggers (RM0090, "TIMx internal trigger connection").
+const TIM2: usize = 0;
+const TIM4: usize = 2;
+const TIM2_TO_TIM4: u32 = 1;
+/// The one trigger output of another peripheral that is wired: OTG_FS's start of frame, as TIM2_OR.ITR1_RMP has it (RM0090, TIM2_OR).
 const OTG_FS_SOF: u32 = 2;
 
 pub(super) struct Device {
@@ -76,6 +80,9 @@ pub struct Board {
     pub(super) awaited: Option<Awaited>,
     /// What a controller's TX pin may do.
     pub(super) transmit_pins: TransmitPins,
+    driven: [Driven; 2],
+    /// Core cycles for which each controller's pin has driven its bus without the controller, and since when it does.
+    pulses: [(u64, Option<u64>); 2],
     frames_cut: u64,
 }
 
@@ -115,6 +122,8 @@ impl Board {
             boot_mode: rom::FLASH,
             awaited: None,
             transmit_pins: TransmitPins::default(),
+            driven: [Driven::default(); 2],
+            pulses: [(0, None); 2],
             frames_cut: 0,
         }
     }
@@ -163,6 +172,47 @@ impl Board {
                 wire.hold_dominant(held, &mut self.can);
             }
         }
+    }
+
+    /// Lets the buses follow what outputs and TIM4 do to the TX pins, from cycle `at` on.
+    pub(super) fn follow_driven_pins(&mut self, at: u64) {
+        let driven = transmit_pins::driven(&self.ports, &self.timers[TIM4]);
+        let before = std::mem::replace(&mut self.driven, driven);
+        for (controller, (now, before)) in driven.into_iter().zip(before).enumerate() {
+            if now == before {
+                continue;
+            }
+            let (total, since) = &mut self.pulses[controller];
+            match (*since, now.dominant) {
+                (None, true) => *since = Some(at),
+                (Some(from), false) => {
+                    *total += at - from;
+                    *since = None;
+                }
+                _ => {}
+            }
+            // A level that begins or ends with the connection belongs to it: the controller is off the pin first, and back last.
+            if let Some(wire) = self.wires.iter_mut().find(|wire| wire.controllers().contains(&controller)) {
+                if now.cut {
+                    wire.cut(controller, true, at, &mut self.can);
+                }
+                wire.drive(now.dominant, at, &mut self.can);
+                if !now.cut {
+                    wire.cut(controller, false, at, &mut self.can);
+                }
+            }
+        }
+    }
+
+    /// Whether controller `n`'s TX pin drives its bus dominant now, as an output or for a timer.
+    pub fn drives(&self, n: usize) -> bool {
+        self.driven[n].dominant
+    }
+
+    /// Core cycles for which controller `n`'s TX pin has driven its bus dominant without the controller, in levels that are over: as an
+    /// output, or for a timer.
+    pub fn driven_cycles(&self, n: usize) -> u64 {
+        self.pulses[n].0
     }
 
     /// Frames that were on a bus when the chip was reset. In the model they end all the same; a real one would be an error on the bus.
@@ -240,6 +290,7 @@ impl Board {
         }
         self.follow_clocks(now);
         self.follow_transmit_pins();
+        self.follow_driven_pins(now);
     }
 
     /// The level of pin `pin` of port `port` (0 for A) if it is an output. For LEDs.
@@ -376,9 +427,7 @@ impl Board {
     pub fn advance(&mut self, now: u64) {
         self.advance_buses(now);
         self.flash.advance(now);
-        for timer in &mut self.timers {
-            timer.advance(now);
-        }
+        self.advance_timers(now);
         let mut trigger = None;
         for device in &self.devices {
             let mut device = device.lock();
@@ -388,6 +437,17 @@ impl Board {
             trigger = device.take_trigger().or(trigger);
         }
         self.trigger(trigger, now);
+    }
+
+    /// Counts up to `now`; what an output does meanwhile reaches its pin at its cycle.
+    fn advance_timers(&mut self, now: u64) {
+        for timer in &mut self.timers {
+            timer.advance(now);
+        }
+        if let Some(at) = self.timers[TIM2].take_trigger() {
+            self.timers[TIM4].internal_trigger(TIM2_TO_TIM4, at);
+        }
+        self.follow_driven_pins(now);
     }
 
     /// A device's trigger output pulsed at a cycle no later than `now`.

@@ -1,6 +1,7 @@
 //! General-purpose and basic timers, counting up (RM0090 Rev 21 §18, §20): prescaler, auto-reload,
-//! four compare channels, their flags and interrupt; and capture of the count by an internal trigger (TRC). Capture by pins, PWM
-//! outputs and slave modes are not modelled.
+//! four compare channels, their flags and interrupt; capture of the count by an internal trigger (TRC); PWM outputs; OC2REF as the trigger
+//! output, and the start of the count by an internal trigger. Capture by pins, the other output modes (except those that channel 2's reference
+//! needs) and the other slave modes are not modelled.
 
 const CEN: u32 = 1;
 const UDIS: u32 = 1 << 1;
@@ -11,6 +12,17 @@ const ARPE: u32 = 1 << 7;
 const TS_SHIFT: u32 = 4;
 /// CCxS: the channel's input is the selected trigger.
 const TRC: u32 = 3;
+/// SMCR.SMS: a trigger starts the count.
+const STARTED_BY_TRIGGER: u32 = 6;
+/// CR2.MMS: the trigger output is OC2REF.
+const OC2REF_IS_TRGO: u32 = 5;
+/// OCxM: active on match, forced active, PWM modes 1 and 2.
+const ACTIVE_ON_MATCH: u32 = 1;
+const FORCED_ACTIVE: u32 = 5;
+const PWM_1: u32 = 6;
+const PWM_2: u32 = 7;
+/// OCxPE: the compare value is taken at the next update.
+const PRELOADED: u32 = 1 << 3;
 /// UIF, and the flags of compare channels 1 to 4 above it.
 const UIF: u32 = 1;
 
@@ -34,6 +46,11 @@ pub struct Timer {
     reload: u32,
     next_reload: u32,
     compare: [u32; 4],
+    next_compare: [u32; 4],
+    /// Channel 2's reference, as long as its mode is to become active on a match.
+    reference_2: bool,
+    /// When that rose, until it is taken.
+    rose_at: Option<u64>,
     /// TIMx_OR: the sources of the internal triggers and inputs.
     options: u32,
 }
@@ -58,6 +75,9 @@ impl Timer {
             reload: max,
             next_reload: max,
             compare: [0; 4],
+            next_compare: [0; 4],
+            reference_2: false,
+            rose_at: None,
             options: 0,
         }
     }
@@ -97,7 +117,7 @@ impl Timer {
                     // Reading what was captured clears the flag that says so.
                     self.flags &= !(UIF << (1 + channel));
                 }
-                self.compare[channel]
+                if self.input(channel) == 0 { self.next_compare[channel] } else { self.compare[channel] }
             }
             0x50 if self.max == u32::MAX => self.options,
             _ => return None,
@@ -130,7 +150,14 @@ impl Timer {
                 }
                 self.flags |= value & 0x1E;
             }
-            0x18..=0x20 => self.modes[(offset - 0x18) as usize / 4] = value,
+            0x18..=0x20 => {
+                self.modes[(offset - 0x18) as usize / 4] = value;
+                match self.output_mode(1) {
+                    ACTIVE_ON_MATCH => {}
+                    FORCED_ACTIVE if !self.reference_2 => self.rise(now),
+                    mode => self.reference_2 = mode == FORCED_ACTIVE,
+                }
+            }
             0x24 => (self.count, self.since) = (value & self.max, now),
             0x28 => self.next_prescaler = value & 0xFFFF,
             0x2C => {
@@ -143,7 +170,10 @@ impl Timer {
                 let channel = (offset - 0x34) as usize / 4;
                 // A captured value is read-only.
                 if self.input(channel) == 0 {
-                    self.compare[channel] = value & self.max;
+                    self.next_compare[channel] = value & self.max;
+                    if self.output(channel) & PRELOADED == 0 {
+                        self.compare[channel] = value & self.max;
+                    }
                 }
             }
             0x50 if self.max == u32::MAX => self.options = value & 0xCC0,
@@ -171,6 +201,76 @@ impl Timer {
         }
     }
 
+    /// A rising edge of another timer's trigger output, which is internal trigger `number`, at core cycle `at`, which may be slightly in
+    /// the past.
+    pub fn internal_trigger(&mut self, number: u32, at: u64) {
+        let selected = self.slave >> TS_SHIFT & 7 == number && self.slave & 7 == STARTED_BY_TRIGGER;
+        if selected && self.control & CEN == 0 {
+            self.control |= CEN;
+            self.since = at;
+        }
+    }
+
+    /// When the trigger output last rose, if it has since the last call.
+    pub fn take_trigger(&mut self) -> Option<u64> {
+        self.rose_at.take()
+    }
+
+    /// The level of a channel's output (0 for channel 1), if it is enabled.
+    pub fn output_level(&self, channel: usize) -> Option<bool> {
+        let enabled = self.modes[2] >> (4 * channel) & 3;
+        let active = match self.output_mode(channel) {
+            PWM_1 => self.count < self.compare[channel],
+            PWM_2 => self.count >= self.compare[channel],
+            ACTIVE_ON_MATCH if channel == 1 => self.reference_2,
+            mode => mode == FORCED_ACTIVE,
+        };
+        // CCxP: active is low.
+        (self.input(channel) == 0 && enabled & 1 != 0).then_some(active != (enabled & 2 != 0))
+    }
+
+    /// When an enabled output of PWM, or the trigger output, changes next by itself.
+    fn next_change(&self) -> Option<u64> {
+        if self.control & CEN == 0 {
+            return None;
+        }
+        let is_pwm = |channel: &usize| {
+            self.input(*channel) == 0
+                && self.modes[2] >> (4 * channel) & 1 != 0
+                && matches!(self.output_mode(*channel), PWM_1 | PWM_2)
+        };
+        let pulses = (0..4).filter(is_pwm);
+        let edges =
+            pulses.flat_map(|channel| [self.ticks_to(self.compare[channel]), Some(self.ticks_to_update())]);
+        let rises = self.awaits_rise().then(|| self.ticks_to(self.compare[1]));
+        let ticks = edges.chain(rises).flatten().min()?;
+        Some(self.since + ticks * self.tick())
+    }
+
+    fn awaits_rise(&self) -> bool {
+        self.control2 >> 4 & 7 == OC2REF_IS_TRGO
+            && self.output_mode(1) == ACTIVE_ON_MATCH
+            && self.input(1) == 0
+            && !self.reference_2
+    }
+
+    fn rise(&mut self, at: u64) {
+        self.reference_2 = true;
+        if self.control2 >> 4 & 7 == OC2REF_IS_TRGO {
+            self.rose_at = Some(at);
+        }
+    }
+
+    /// A channel's byte of CCMR.
+    fn output(&self, channel: usize) -> u32 {
+        self.modes[channel / 2] >> (8 * (channel % 2)) & 0xFF
+    }
+
+    /// OCxM.
+    fn output_mode(&self, channel: usize) -> u32 {
+        self.output(channel) >> 4 & 7
+    }
+
     /// CCxS: 0 for an output, which compares; otherwise the source of the input.
     fn input(&self, channel: usize) -> u32 {
         self.modes[channel / 2] >> (8 * (channel % 2)) & 3
@@ -187,8 +287,12 @@ impl Timer {
         self.flags & self.interrupts & 0x1F != 0
     }
 
-    /// When the next enabled flag that is not set yet will be set.
+    /// When the next enabled flag that is not set yet will be set, or an output changes.
     pub fn next_event(&self) -> Option<u64> {
+        self.rose_at.into_iter().chain(self.next_flag()).chain(self.next_change()).min()
+    }
+
+    fn next_flag(&self) -> Option<u64> {
         let wanted = self.interrupts & !self.flags & 0x1F;
         if self.control & CEN == 0 || wanted == 0 {
             return None;
@@ -215,8 +319,12 @@ impl Timer {
             let step = ticks.min(to_update);
             for channel in 0..4 {
                 let compares = self.input(channel) == 0;
-                if compares && self.ticks_to(self.compare[channel]).is_some_and(|due| due <= step) {
+                let due = self.ticks_to(self.compare[channel]);
+                if let Some(due) = due.filter(|due| compares && *due <= step) {
                     self.flags |= UIF << (1 + channel);
+                    if channel == 1 && self.awaits_rise() {
+                        self.rise(self.since + due * self.tick());
+                    }
                 }
             }
             self.since += step * self.tick();
@@ -239,6 +347,11 @@ impl Timer {
     fn take_preloads(&mut self) {
         self.prescaler = self.next_prescaler;
         self.reload = self.next_reload;
+        for channel in 0..4 {
+            if self.input(channel) == 0 {
+                self.compare[channel] = self.next_compare[channel];
+            }
+        }
     }
 
     /// Core cycles of a count.
@@ -312,6 +425,59 @@ mod tests {
         assert!(!timer.irq());
         // The same value recurs a whole turn later.
         assert_eq!(timer.next_event(), Some((100 + (1 << 32)) * 12));
+    }
+
+    /// The stamp timer's channel 2, and a timer that it starts for one pulse: low from its first tick to its end.
+    fn pair(ticks: u32) -> (Timer, Timer) {
+        let mut master = stamp_timer();
+        master.write(0x04, OC2REF_IS_TRGO << 4, 0).unwrap();
+        master.write(0x38, 100, 0).unwrap();
+        master.write(0x18, 1 << 12, 0).unwrap();
+        let mut pulse = Timer::new(16);
+        pulse.set_cycles_per_clock(2, 0);
+        let setup = [
+            (0x08, 1 << TS_SHIFT | STARTED_BY_TRIGGER),
+            (0x18, 0x78),
+            (0x20, 3),
+            (0x28, 5),
+            (0x2C, ticks),
+            (0x34, 1),
+            (0x00, OPM | URS | ARPE),
+            (0x14, 1),
+        ];
+        for (offset, value) in setup {
+            pulse.write(offset, value, 0).unwrap();
+        }
+        (master, pulse)
+    }
+
+    #[test]
+    fn a_match_starts_another_timer_s_pulse_which_ends_by_itself() {
+        let (mut master, mut pulse) = pair(72);
+        assert_eq!((master.next_event(), pulse.next_event()), (Some(1200), None));
+        assert_eq!(pulse.output_level(0), Some(true));
+        master.advance(1205);
+        let at = master.take_trigger().unwrap();
+        assert_eq!((at, master.take_trigger(), master.next_event()), (1200, None, None));
+        pulse.internal_trigger(1, at);
+        for (now, level) in [(1211, true), (1212, false), (1212 + 72 * 12 - 1, false), (1212 + 72 * 12, true)]
+        {
+            pulse.advance(now);
+            assert_eq!(pulse.output_level(0), Some(level), "{now}");
+        }
+        assert_eq!(pulse.read(0x10, 3000).unwrap() & UIF, UIF);
+        assert_eq!((pulse.read(0x00, 3000).unwrap() & CEN, pulse.next_event()), (0, None));
+        assert_eq!(pulse.output_level(0), Some(true));
+    }
+
+    #[test]
+    fn a_trigger_that_was_not_chosen_starts_nothing() {
+        for (number, slave) in [(0, 1 << TS_SHIFT | STARTED_BY_TRIGGER), (1, 1 << TS_SHIFT), (1, 0)] {
+            let (_, mut pulse) = pair(72);
+            pulse.write(0x08, slave, 0).unwrap();
+            pulse.internal_trigger(number, 100);
+            assert_eq!((pulse.next_event(), pulse.output_level(0)), (None, Some(true)));
+        }
     }
 
     /// The stamp timer, with channel 4 latching OTG_FS's start of frame.

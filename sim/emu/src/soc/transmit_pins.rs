@@ -1,7 +1,9 @@
-//! The pins on which the CAN controllers send, as far as they can hold a bus dominant although no controller sends.
+//! The pins on which the CAN controllers send, as far as they can drive a bus although no controller sends: a controller that is stuck, a
+//! pin that a program has made an output, and a pin that is connected to a timer instead.
 
 use super::rcc::Rcc;
 use super::small::Gpio;
+use super::timer::Timer;
 use crate::Clock;
 use crate::hostile::{CanFaults, Dice, Hostile};
 
@@ -9,6 +11,9 @@ use crate::hostile::{CanFaults, Dice, Hostile};
 const CAN: u32 = 9;
 /// Every pin that can be each controller's TX: port (0 for A) and pin (DS8626, as above).
 const TX: [&[(usize, u32)]; 2] = [&[(0, 12), (1, 9), (3, 1), (7, 13)], &[(1, 6), (1, 13)]];
+/// The alternate function of TIM4, and its channels among the TX pins: controller, port, pin and channel from 0 (DS8626, as above).
+const TIM4: u32 = 2;
+const TIM4_TX: [(usize, usize, u32, usize); 2] = [(0, 1, 9, 3), (1, 1, 6, 0)];
 /// The enable register on APB1, and the bit of each controller.
 const ENABLE: (u32, [u32; 2]) = (0x40, [25, 26]);
 
@@ -22,6 +27,32 @@ pub struct TransmitPins {
     stuck: [bool; 2],
     /// Held dominant.
     held: [bool; 2],
+}
+
+/// What the pins of a controller do to its bus.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Driven {
+    /// A pin that is not the controller's drives it dominant.
+    pub dominant: bool,
+    /// The controller's pin is a timer's.
+    pub cut: bool,
+}
+
+/// What the pins do that are outputs, or `timer`'s, which is TIM4.
+pub fn driven(ports: &[Gpio], timer: &Timer) -> [Driven; 2] {
+    [0, 1].map(|controller| {
+        let is_low = |(port, pin): &(usize, u32)| ports[*port].output(*pin) == Some(false);
+        let is_output_low = TX[controller].iter().any(is_low);
+        let of_timer = TIM4_TX
+            .iter()
+            .find(|(of, port, pin, _)| *of == controller && ports[*port].is_connected(*pin, TIM4));
+        // An output that is not enabled is no level: the transceiver reads recessive.
+        let is_timer_low = of_timer.is_some_and(|(.., channel)| timer.output_level(*channel) == Some(false));
+        Driven {
+            dominant: is_output_low || is_timer_low,
+            cut: (is_output_low || of_timer.is_some()) && !is_connected(controller, ports),
+        }
+    })
 }
 
 fn is_connected(controller: usize, ports: &[Gpio]) -> bool {

@@ -1,9 +1,9 @@
 //! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, GATEWAY_TAG,
-    GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic, RegisterSet, Registers,
-    Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
+    ChannelConfig, ChannelStatus, Checksum, DISTURBANCE_WORD, Defaults, Edge, Edges, Failures, Filter,
+    FrameKind, GATEWAY_TAG, GatewayEnd, GatewayRule, GatewayState, GatewayStatus, Modifier, Pass, Periodic,
+    RegisterSet, Registers, Role, RuleCounts, Status, Trigger, TxFdFrame, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, FdFrame, Frame, Hello, Id, Refusal, Reply};
@@ -66,6 +66,7 @@ pub fn events() -> Vec<(Event, &'static str)> {
             Event::TransmitFailed { channel, tag: GATEWAY_TAG, reason: TransmitFailure::Loop },
             "07 01 80 80 ff ff 0f 06",
         ),
+        (Event::Disturbed { channel, ticks: 300 }, "09 01 ac 02"),
     ]
 }
 
@@ -180,6 +181,8 @@ pub fn commands() -> Vec<(Command, &'static str)> {
             },
             "1c 01 02 01 a3 82 80 80 04 02 01 02 00 ac 02 81 80 80 80 02 0c 00 00 00 00 00 00 00 00 00 00 00 00 01 ac 02",
         ),
+        (Command::UnlockDisturbance { word: DISTURBANCE_WORD }, "1d a3 e9 83 a2 0e"),
+        (Command::Disturb { channel, at_ticks: 300, bits: 6 }, "1e 01 ac 02 06"),
     ]
 }
 
@@ -328,5 +331,8 @@ pub fn refusals() -> Vec<(Refusal, &'static str)> {
         (Refusal::NoBoard, "18"),
         (Refusal::NotNormal, "19"),
         (Refusal::GatewayRunning, "1a"),
+        (Refusal::DisturbanceLocked, "1b"),
+        (Refusal::TooOften, "1c"),
+        (Refusal::TooLate, "1d"),
     ]
 }

@@ -176,6 +176,11 @@ impl Controller {
         self.dominant_bits += dominant_bits;
     }
 
+    /// It puts another number of dominant bits on the bus in the frame under way than was counted.
+    pub(crate) fn drove_instead(&mut self, counted: u64, driven: u64) {
+        self.dominant_bits = self.dominant_bits - counted + driven;
+    }
+
     /// The bus is held dominant: the frame under way never ends.
     pub(crate) fn bus_stuck(&mut self) {
         self.receiving |= self.listens();

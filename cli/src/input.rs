@@ -232,6 +232,14 @@ impl Records {
         }
     }
 
+    /// Bit rates of a file's channels, from 1, as far as it has said them.
+    pub fn bit_rates(&self) -> &[(u8, u32)] {
+        match &self.source {
+            Source::File(reader, _) => reader.bit_rates(),
+            Source::Device(_) => &[],
+        }
+    }
+
     /// At the end: an error if this was a device that received errors but no frame, as at a wrong bit rate.
     pub fn judge(&self) -> anyhow::Result<()> {
         match &self.source {

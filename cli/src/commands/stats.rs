@@ -48,7 +48,8 @@ pub struct Args {
     #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel; auto has a device find it by
-    /// listening. Can be repeated. Without it, a file has no load, and a device listens at the saved bit rate.
+    /// listening. Can be repeated. Without it, a file has a load if it
+    /// says its bit rates (pcapng), and a device listens at the saved bit rate.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), only for that channel. Can
@@ -154,6 +155,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         };
         let mut batch = Vec::new();
         while records.next_batch(&mut batch)? {
+            for (channel, bitrate_bps) in records.bit_rates() {
+                statistics.learn_bitrate(*channel, *bitrate_bps);
+            }
             for record in &batch {
                 statistics.push_with(record, &mut closed);
             }

@@ -45,6 +45,12 @@ fn a_capture_finds_its_bit_rates_and_the_trace_keeps_them() {
     let trace = std::fs::read(&path).unwrap();
     let text = b"125000 bit/s, listening only";
     assert!(trace.windows(text.len()).any(|bytes| bytes == text));
+    let (_, out, _) = cantap(&format!("stats --json {}", path.display()));
+    let statistics: serde_json::Value = serde_json::from_str(&out).unwrap();
+    for channel in statistics["channels"].as_array().unwrap() {
+        assert_eq!(channel["bitrate_bps"], 125_000, "{out}");
+        assert!(channel["bus_load_pct"].as_f64() > Some(0.0), "{out}");
+    }
     let (_, out, _) = cantap(&format!("{CAPTURE} -b auto -n 50 --json"));
     assert_nothing_but_frames(&out);
 }

@@ -35,6 +35,11 @@ pub(crate) trait Decode: Send {
         None
     }
 
+    /// Bit rates that the file has said so far, outside CAN FD's data phases: channel from 1, bit/s.
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &[]
+    }
+
     /// Between two batches: appends what reading on depends on besides the bytes that follow. False if reading cannot begin here, or nowhere in
     /// files of the format but at their beginning.
     fn save(&self, _state: &mut Vec<u8>) -> bool {

@@ -215,6 +215,11 @@ mod tests {
         assert_eq!(statistics(&seen())[2..], [[0, 1, 0, 1], [1, 7, 7, 0]]);
         writer.finish().unwrap();
         assert_eq!(statistics(&seen())[4..], [[0, 1, 0, 1], [1, 7, 7, 0]]);
+        let trace = std::io::Cursor::new(pipe.0.lock().unwrap().clone());
+        let options = crate::ReadOptions::default();
+        let mut reader = crate::TraceReader::from_source("a", trace, Format::Pcapng, &options).unwrap();
+        assert_eq!(reader.by_ref().flatten().count(), 2);
+        assert_eq!(reader.bit_rates(), [(1, 500_000), (2, 500_000)]);
     }
 
     /// Wireshark shows drop counts only to users who look for them.

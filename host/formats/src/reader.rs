@@ -298,6 +298,12 @@ impl TraceReader {
         properties.map(|(name, value)| (name.as_str(), value.as_str()))
     }
 
+    /// Bit rates of channels, outside CAN FD's data phases, as far as the file has said them: channel from 1, bit/s. One is known before
+    /// the first record of its channel is handed out.
+    pub fn bit_rates(&self) -> &[(u8, u32)] {
+        self.decoder.bit_rates()
+    }
+
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));

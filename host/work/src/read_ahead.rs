@@ -31,6 +31,7 @@ enum Next {
 struct Known {
     missing: Missing,
     notes: LeftOut,
+    bit_rates: Vec<(u8, u32)>,
 }
 
 type Item = (Next, Known);
@@ -110,6 +111,11 @@ impl ReadAhead {
         self.known.missing.clone()
     }
 
+    /// As [`TraceReader::bit_rates`], of what was handed out so far.
+    pub const fn bit_rates(&self) -> &[(u8, u32)] {
+        self.known.bit_rates.as_slice()
+    }
+
     /// What else is known about the file so far, and how often.
     pub const fn notes(&self) -> &LeftOut {
         &self.known.notes
@@ -177,7 +183,8 @@ fn read(mut reader: TraceReader, filled: &SyncSender<Vec<Item>>, used: &Receiver
             None => Next::End(reader.nothing_read()),
         };
         let is_end = matches!(next, Next::End(_));
-        group.push((next, Known { missing: Missing::of(&reader), notes: reader.notes().clone() }));
+        let (notes, bit_rates) = (reader.notes().clone(), reader.bit_rates().to_vec());
+        group.push((next, Known { missing: Missing::of(&reader), notes, bit_rates }));
         if is_end || group.len() == GROUP || reader.would_wait() {
             let group = std::mem::replace(&mut group, Vec::with_capacity(GROUP));
             if filled.send(group).is_err() || is_end {

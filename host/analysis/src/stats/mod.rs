@@ -171,6 +171,15 @@ impl Statistics {
         self.channels[place].push(record, &mut closed);
     }
 
+    /// A trace has said a channel's bit rate. It is used from the channel's first record on, unless the options have one or the window is too
+    /// short for it.
+    pub fn learn_bitrate(&mut self, channel: u8, bitrate_bps: u32) {
+        let is_possible = bitrate_bps > 0 && self.window_ns >= shortest_window_ns(bitrate_bps);
+        if is_possible && self.options.bitrate_of(channel).is_none() {
+            self.options.channel_bitrate_bps.push((channel, bitrate_bps));
+        }
+    }
+
     /// The channel's index; it is added if necessary.
     #[cold]
     fn find_channel(&mut self, record: &TraceRecord) -> usize {

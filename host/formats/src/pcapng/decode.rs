@@ -12,9 +12,10 @@ use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
     BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, CUSTOM, CUSTOM_NOT_COPIED, DIRECTION, END, ENHANCED_PACKET,
-    EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE, NAME_RESOLUTION,
-    OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER, SIMPLE_PACKET, STATISTICS,
+    EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_SPEED, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE,
+    NAME_RESOLUTION, OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER, SIMPLE_PACKET, STATISTICS,
 };
+use cantap_can::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 use serde::{Deserialize, Serialize};
 
@@ -33,6 +34,8 @@ pub(crate) struct Decoder {
     /// For captures of the "any" interface: the interfaces that the packets name.
     cooked: Interfaces,
     packets: Packets,
+    /// Channel, from 1, and bit/s.
+    bit_rates: Vec<(u8, u32)>,
 }
 
 /// The content of an interface description.
@@ -116,18 +119,22 @@ impl Decode for Decoder {
         false
     }
 
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
+    }
+
     fn save(&self, state: &mut Vec<u8>) -> bool {
         /// With more interfaces reading begins nowhere else: each place has them all.
         const MOST_INTERFACES: usize = 256;
-        let Self { big_endian, started, interfaces, names, cooked, packets } = self;
+        let Self { big_endian, started, interfaces, names, cooked, packets, bit_rates } = self;
         packets.errors.is_over()
             && interfaces.len() <= MOST_INTERFACES
-            && seek::save(&(big_endian, started, interfaces, names, cooked, packets.dirty), state)
+            && seek::save(&(big_endian, started, interfaces, names, cooked, packets.dirty, bit_rates), state)
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
-        (self.big_endian, self.started, self.interfaces, self.names, self.cooked, self.packets.dirty) =
-            seek::load(state)?;
+        let Self { big_endian, started, interfaces, names, cooked, packets, bit_rates } = self;
+        (*big_endian, *started, *interfaces, *names, *cooked, packets.dirty, *bit_rates) = seek::load(state)?;
         Some(())
     }
 
@@ -296,7 +303,7 @@ impl Decoder {
             return Some(());
         }
         let mut name = format!("can{}", self.interfaces.len()).into_bytes();
-        let (mut resolution, mut offset_s) = (1_000_000, 0);
+        let (mut resolution, mut offset_s, mut bit_rate) = (1_000_000, 0, None);
         for (code, value) in fields.options(8) {
             match code {
                 IF_NAME if !value.bytes.is_empty() => name = value.bytes.to_vec(),
@@ -306,10 +313,18 @@ impl Decoder {
                     resolution = base.checked_pow(u32::from(exponent & 0x7F)).unwrap_or(u64::MAX);
                 }
                 IF_TSOFFSET => offset_s = value.u64(0).unwrap_or(0).cast_signed(),
+                IF_SPEED => bit_rate = value.u64(0).and_then(|speed| u32::try_from(speed).ok()),
                 _ => {}
             }
         }
         let channel = self.names.channel(&name);
+        // Other programs write zero, or the speed of what is not a bus.
+        if let Some(bit_rate) =
+            bit_rate.filter(|bit_rate| (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(bit_rate))
+            && self.bit_rates.iter().all(|(known, _)| *known != channel)
+        {
+            self.bit_rates.push((channel, bit_rate));
+        }
         let link = Link::of(u32::from(link_type), self.big_endian);
         self.interfaces.push(Interface { link, channel, resolution, offset_s });
         Some(())

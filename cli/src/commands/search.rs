@@ -18,7 +18,7 @@ use super::decode;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::exit;
-use crate::input::{FollowArgs, Records, not_a_message};
+use crate::input::{FollowArgs, Records, not_a_message, of_a_trace};
 use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
 use crate::range_args::RangeArgs;
@@ -30,7 +30,9 @@ use cantap_work::terms::failure_text;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_a_trace),
+    after_help = "Examples:\n  \
                 cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
                 cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
                 cantap search trace.blf --data '* DE AD' -o found.asc\n  \
@@ -42,7 +44,8 @@ use cantap_work::terms::failure_text;
                 >=, not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == \
                 5 and canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it \
                 what it says.\n\n\
-                Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
+                Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line."
+)]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]

@@ -205,7 +205,7 @@ fn ctrl_c_leaves_no_node_in_configuration_mode() {
     begin();
     signal(&lss, "-INT");
     let (code, said) = end(lss, "lss");
-    assert!(code == Some(1) && said.contains("ended by Ctrl-C"), "{said}");
+    assert!(code == Some(130) && said.contains("ended by Ctrl-C"), "{said}");
     signal(&listener, "-INT");
     end(listener, "capture");
     let log = std::fs::read_to_string(&log).unwrap();

@@ -81,7 +81,7 @@ pub fn of_a_trace(arg: Arg) -> Arg {
 
 /// The option means nothing for a device.
 pub fn needs_a_trace(arg: Arg) -> Arg {
-    arg.requires("input").conflicts_with("device")
+    arg.requires("input").conflicts_with_all(["device", "time", "device_intervals"])
 }
 
 impl Deref for FollowArgs {

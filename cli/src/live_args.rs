@@ -24,7 +24,7 @@ pub struct LiveArgs {
     channel: Channels,
     /// Bit rate of the bus in bit/s: 500000, 500k, 1M; or auto, to find it by listening; with a channel before it (2:250k), only
     /// for that channel. Can be repeated. Without it, the one saved on the device.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", conflicts_with = "input", add = completion::bit_rates())]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", conflicts_with_all = ["input", "follow"], add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
     /// How long to listen, as 10, 500ms or 2m.
     #[arg(short, long, conflicts_with = "input", value_parser = args::positive_duration)]

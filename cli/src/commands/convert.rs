@@ -65,7 +65,7 @@ pub struct Args {
     /// Make OUT a folder of Parquet files, in folders named after these, in this order: day, channel, or NAME=VALUE. Engines read
     /// it as one table. The files are named after IN: converting it again replaces them.
     #[cfg(feature = "parquet")]
-    #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with = "format")]
+    #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with_all = ["format", "rotate"])]
     partition: Vec<Key>,
     /// Print the numbers as a JSON object, to standard error if the trace goes to standard output.
     #[arg(long)]

@@ -82,13 +82,13 @@ pub struct Args {
     #[arg(short, long, value_name = "N")]
     max_count: Option<u64>,
     /// Print only the number found.
-    #[arg(long, conflicts_with_all = ["output", "json"])]
+    #[arg(long, conflicts_with_all = ["output", "json", "written_format"])]
     count: bool,
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
     /// The format to write, if the output's name does not show it.
-    #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
+    #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", conflicts_with = "json", add = completion::written_formats())]
     written_format: Option<Format>,
     /// Print one JSON object per record, followed by one with the summary.
     #[arg(long)]

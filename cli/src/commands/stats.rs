@@ -19,7 +19,7 @@ use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::input::{FollowArgs, filtered, needs_a_trace, of_a_trace};
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
-use crate::protocols::{Known, ProtocolArgs};
+use crate::protocols::{Known, ProtocolArgs, needs_protocols};
 use crate::range_args::RangeArgs;
 use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
@@ -32,6 +32,7 @@ use cantap_work::timing_options::TimingOptions;
 #[derive(clap::Args)]
 #[command(
     mut_args(of_a_trace),
+    mut_args(needs_protocols),
     mut_arg("strict", needs_a_trace),
     after_help = "Examples:\n  \
                 cantap stats trace.log -b 500k\n  \

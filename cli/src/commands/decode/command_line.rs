@@ -11,13 +11,14 @@ use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::{FollowArgs, of_a_trace};
 use crate::live_args::LiveArgs;
-use crate::protocols::ProtocolArgs;
+use crate::protocols::{ProtocolArgs, needs_protocols};
 use crate::range_args::RangeArgs;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
     mut_args(of_a_trace),
+    mut_args(needs_protocols),
     after_help = "Examples:\n  \
                 cantap decode --db car.dbc trace.log\n  \
                 cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' \\\n      \

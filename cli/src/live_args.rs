@@ -26,7 +26,7 @@ pub struct LiveArgs {
     /// for that channel. Can be repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", conflicts_with_all = ["input", "follow"], add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
-    /// How long to listen, as 10, 500ms or 2m.
+    /// How long to listen to the device, as 10, 500ms or 2m.
     #[arg(short, long, conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Keep intervals as the device's crystal measures them, instead of following UTC.

@@ -177,7 +177,7 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
 /// What is asked for and cannot be had is refused, and not ignored: nothing is opened.
 #[test]
 fn options_that_mean_nothing_there_are_refused() {
-    let (alone, plot) = ("cannot be used with", "plot {trace} --db no.dbc");
+    let alone = "cannot be used with";
     for (line, part) in [
         ("search {trace} --id 1 -t 1s", alone),
         ("decode {trace} --protocols -b 500k", alone),
@@ -196,9 +196,9 @@ fn options_that_mean_nothing_there_are_refused() {
         ("decode {trace} --protocols --text-cells", "add --csv"),
         ("db no.dbc --strict", "--coverage"),
         ("db no.dbc --message A -f 1", alone),
-        (&format!("{plot} -s A -b 500k"), alone),
-        (&format!("{plot} -w 1s"), "--bus-load"),
-        (&format!("{plot} --timing 123 --curves 3"), alone),
+        ("plot {trace} --db no.dbc -s A -b 500k", alone),
+        ("plot {trace} --db no.dbc -w 1s", "--bus-load"),
+        ("plot {trace} --timing 123 --curves 3", alone),
         ("monitor {trace} --once --normal", "--normal is for a device"),
         ("monitor {trace} --once --mode normal", "--mode is for a device"),
         ("monitor {trace} --once -t 1s", "-t is for a device"),

@@ -84,6 +84,18 @@ impl ChannelArgs {
         }
     }
 
+    /// The first option that was given and is about a device; a bit rate may be a trace's, too.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.mode.is_some(), "--mode"),
+            (self.one_shot, "--one-shot"),
+            (self.recovery.is_some(), "--recovery"),
+            (self.no_data, "--no-data"),
+            (self.no_stamps, "--no-stamps"),
+        ];
+        given.into_iter().find_map(|(given, option)| given.then_some(option)).or(self.timing.given())
+    }
+
     /// See [`ChannelOptions::bus_off_recovery`]; it reports on standard error.
     pub fn bus_off_recovery(&self) -> BusOffRecovery {
         self.options().bus_off_recovery(&stderr::reporter())

@@ -10,11 +10,13 @@ use cantap_formats::{Columns, Format, LeftOut, ReadOptions, Zone, open_reader};
 use cantap_signals::Decoder;
 use cantap_signals::named::{NameError, NamedFilter};
 use cantap_trace::filter::Filter;
+use clap::Arg;
 
 use crate::completion;
 use crate::live_args::LiveArgs;
 use crate::usage_error::usage;
 use cantap_work::cache;
+use cantap_work::channels::Channels;
 use cantap_work::interrupt;
 use cantap_work::live::LiveRecords;
 use cantap_work::missing::Missing;
@@ -68,6 +70,20 @@ impl ReadArgs {
     }
 }
 
+/// Those of these options that concern a file, and not what a device is listened to for. For `Command::mut_args` of a command that does either: its
+/// file is `input`, and its device `device`.
+pub fn of_a_trace(arg: Arg) -> Arg {
+    match arg.get_id().as_str() {
+        "format" | "columns" | "zone" | "follow" => needs_a_trace(arg),
+        _ => arg,
+    }
+}
+
+/// The option means nothing for a device.
+pub fn needs_a_trace(arg: Arg) -> Arg {
+    arg.requires("input").conflicts_with_all(["device", "time", "device_intervals"])
+}
+
 impl Deref for FollowArgs {
     type Target = ReadArgs;
 
@@ -91,7 +107,7 @@ impl FollowArgs {
     ) -> anyhow::Result<Records> {
         match (live.open(path)?, path) {
             (Some(live), _) => Ok(Records::new(Source::Device(live), filters, self.strict)),
-            (None, Some(path)) => self.open(path, filters),
+            (None, Some(path)) => Ok(self.open(path, filters)?.of_channels(live.channels())),
             (None, None) => bail!("give a trace to read, or a device with -d"),
         }
     }
@@ -124,6 +140,7 @@ const ISSUES_SHOWN: u64 = 20;
 pub struct Records {
     source: Source,
     filters: Vec<Filter>,
+    channels: Channels,
     range: TimeRange,
     strict: bool,
     /// The batch from which [`Self::next`] takes; the records before `at` are used up.
@@ -176,7 +193,8 @@ impl ReadArgs {
 
 impl Records {
     fn new(source: Source, filters: Vec<Filter>, strict: bool) -> Self {
-        Self { source, filters, range: TimeRange::default(), strict, batch: Vec::new(), at: 0 }
+        let (channels, range) = (Channels::all(), TimeRange::default());
+        Self { source, filters, channels, range, strict, batch: Vec::new(), at: 0 }
     }
 
     /// Only the records in a range, which may begin at a time after the first record, whether or not that passes the filters.
@@ -186,6 +204,12 @@ impl Records {
         }
         self.range = range;
         Ok(self)
+    }
+
+    /// Only those of these channels.
+    pub fn of_channels(mut self, channels: &Channels) -> Self {
+        self.channels = channels.clone();
+        self
     }
 
     /// Whether the next record may take a while, so that results should not be buffered.
@@ -257,6 +281,9 @@ impl Records {
         };
         if !self.range.is_all() {
             records.retain(|record| self.range.contains(record));
+        }
+        if self.channels != Channels::all() {
+            records.retain(|record| self.channels.has(record.channel));
         }
         if !self.filters.is_empty() {
             records.retain(|record| self.filters.iter().any(|filter| filter.accepts(record)));

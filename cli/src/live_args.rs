@@ -19,15 +19,15 @@ pub struct LiveArgs {
     /// consecutively.
     #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
-    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
+    /// The channels, of the device or in the file: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: Channels,
     /// Bit rate of the bus in bit/s: 500000, 500k, 1M; or auto, to find it by listening; with a channel before it (2:250k), only
     /// for that channel. Can be repeated. Without it, the one saved on the device.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", conflicts_with_all = ["input", "follow"], add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
-    /// How long to listen, as 10, 500ms or 2m.
-    #[arg(short, long, value_parser = args::positive_duration)]
+    /// How long to listen to the device, as 10, 500ms or 2m.
+    #[arg(short, long, conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Keep intervals as the device's crystal measures them, instead of following UTC.
     #[arg(long, conflicts_with = "input")]
@@ -38,6 +38,11 @@ impl LiveArgs {
     /// The given devices.
     pub fn devices(&self) -> impl Iterator<Item = &Address> {
         self.device.iter()
+    }
+
+    /// The channels, of the devices or in the trace.
+    pub const fn channels(&self) -> &Channels {
+        &self.channel
     }
 
     /// Opens the devices and their channels: the given ones or, without a file, the one that is connected.

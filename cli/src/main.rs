@@ -49,8 +49,11 @@ mod usage_error;
 mod vocabulary;
 
 use std::error::Error;
+use std::path::Path;
 use std::process::ExitCode;
 
+use cantap_work::interrupt;
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser};
 use clap_complete::CompleteEnv;
 
@@ -60,7 +63,8 @@ use clap_complete::CompleteEnv;
     name = "cantap",
     version,
     disable_help_subcommand = true,
-    after_help = "Exit codes: 0 success, 1 failure, 2 wrong command line, 3 a check did not hold."
+    after_help = "Exit codes: 0 success, 1 failure, 2 wrong command line, 3 a check did not hold, 130 ended by Ctrl-C before it was done. \
+                  What runs until Ctrl-C, such as capture, ends with 0."
 )]
 struct Cli {
     #[command(subcommand)]
@@ -72,27 +76,45 @@ fn main() -> ExitCode {
     CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
     let arguments = commands::extcap::arguments(std::env::args_os());
     let line = commands::help::grouped(Cli::command());
+    let command = arguments.get(1).and_then(|name| line.find_subcommand(name)).cloned();
     let parsed = line.clone().try_get_matches_from(arguments);
-    let cli =
-        parsed.and_then(|matches| Cli::from_arg_matches(&matches)).unwrap_or_else(|error| leave(&error));
+    let cli = parsed
+        .and_then(|matches| Cli::from_arg_matches(&matches))
+        .unwrap_or_else(|error| leave(error, command.as_ref()));
+    let ends_by_itself = cli.command.ends_by_itself();
     match cli.command.run(line) {
         Ok(code) => code,
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("cantap: {}", cantap_work::advice::sentence(&error));
-            ExitCode::from(if is_usage_error(&error) { exit::WRONG_COMMAND_LINE } else { exit::FAILURE })
+            ExitCode::from(match error {
+                error if is_usage_error(&error) => exit::WRONG_COMMAND_LINE,
+                _ if ends_by_itself && interrupt::requested() => interrupt::ENDED_BY_SIGNAL,
+                _ => exit::FAILURE,
+            })
         }
     }
 }
 
 /// The command line is wrong, or requests help. A device's options are a language of their own: an error in one is reported like an
 /// error in a condition, on one line.
-fn leave(error: &clap::Error) -> ! {
+fn leave(mut error: clap::Error, command: Option<&clap::Command>) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());
     if let Some(address @ cantap_address::AddressError::Option { .. }) = address {
         eprintln!("cantap: {address}");
         std::process::exit(exit::WRONG_COMMAND_LINE.into());
+    }
+    // Some commands take a device without -d.
+    let takes_device =
+        command.is_some_and(|command| command.get_arguments().any(|arg| arg.get_short() == Some('d')));
+    if let Some(ContextValue::String(text)) = error.get(ContextKind::InvalidArg)
+        && takes_device
+        && error.kind() == ErrorKind::UnknownArgument
+        && cantap_address::Address::is_meant_by(Path::new(text))
+    {
+        let advice = format!("a device is given with -d, as in: -d {text}");
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![advice.into()]));
     }
     error.exit()
 }

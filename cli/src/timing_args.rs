@@ -49,6 +49,18 @@ impl Preferences {
 }
 
 impl TimingArgs {
+    /// The first option that was given besides bit rates.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.preferences.sample_point.is_some(), "--sample-point"),
+            (self.preferences.sjw.is_some(), "--sjw"),
+            (self.preferences.triple, "--triple"),
+            (self.segments.is_some(), "--segments"),
+            (self.btr.is_some(), "--btr"),
+        ];
+        given.into_iter().find_map(|(given, option)| given.then_some(option))
+    }
+
     /// The same without clap.
     pub fn options(&self) -> TimingOptions {
         let Preferences { sample_point, sjw, triple } = self.preferences;

@@ -11,6 +11,7 @@ use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 
 #[cfg(feature = "parquet")]
 use crate::columns::{self, FrameFiles};
+use crate::usage_error::usage;
 use cantap_work::atomic_file::AtomicFile;
 
 /// A trace being written. An older file with its name stays unchanged until this one is complete.
@@ -143,6 +144,20 @@ pub fn refuse_parquet(path: &Path) -> anyhow::Result<()> {
 #[cfg(not(feature = "parquet"))]
 const WITHOUT_PARQUET: &str = "this build has no Parquet; add `--features parquet` to its command line, or install the command with \
      `cargo install --locked --path cli`";
+
+/// Refuses, before a bus is listened to, a format that cannot be written while its records come.
+pub fn refuse_unwritten(format: Format) -> anyhow::Result<()> {
+    if format.is_written() {
+        return Ok(());
+    }
+    let why = if format == Format::Parquet {
+        "is complete only at its end; capture to a .log or .blf, and convert that with cantap convert"
+            .to_owned()
+    } else {
+        format!("is only read; those that are written are {}", Format::written_names())
+    };
+    Err(usage(format!("{format} {why}")))
+}
 
 /// Refuses to overwrite what a bus said once and will not say again.
 pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {

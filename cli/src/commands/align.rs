@@ -16,7 +16,7 @@ use crate::args::duration;
 use crate::completion;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
-use crate::trace_output::TraceOutput;
+use crate::trace_output::{TraceOutput, named};
 use crate::usage_error::usage;
 use cantap_work::missing::Missing;
 
@@ -105,12 +105,20 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             refuse_same_file(path, output)?;
         }
     }
+    let options = match (&args.output, args.write.given()) {
+        (None, Some(option)) => {
+            return Err(usage(format!("{option} is about the trace to write; give its name with -o")));
+        }
+        (None, None) => None,
+        (Some(path), _) => {
+            let options = named(args.write.options(None)?, path)?;
+            args.write.check_style(options.format)?;
+            Some((path, options))
+        }
+    };
     let (clocks, offsets) = if args.shift.is_empty() { find(args)? } else { given(args)? };
     let mut merged = Merged::open(args, clocks, &offsets)?;
-    let mut output = match &args.output {
-        Some(path) => Some(TraceOutput::create(path, &args.write.options(None)?, false)?),
-        None => None,
-    };
+    let mut output = options.map(|(path, options)| TraceOutput::create(path, &options, false)).transpose()?;
     while let Some(record) = merged.next()? {
         if let Some(output) = &mut output {
             output.write(&record)?;

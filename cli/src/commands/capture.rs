@@ -23,7 +23,7 @@ use crate::completion;
 use crate::input::resolved;
 use crate::progress::Progress;
 use crate::stderr;
-use crate::trace_output::refuse_older;
+use crate::trace_output::{refuse_older, refuse_unwritten};
 use crate::trigger_args::TriggerArgs;
 use crate::usage_error::usage;
 use cantap_work::boards::Boards;
@@ -188,10 +188,21 @@ fn create_sink(args: &Args, trigger: Option<Trigger>, channels: Vec<ChannelInfo>
 
 /// Refuses a file that cannot be written as asked, before a device is touched.
 fn refuse_output(args: &Args) -> anyhow::Result<()> {
-    let Some(path) = args.output.as_deref().filter(|path| path.as_os_str() != "-") else { return Ok(()) };
-    if args.write.options(implied_format(path))?.format.is_none() {
-        Format::of_path(path)?;
+    let path = args.output.as_deref();
+    if let (None, true, Some(option)) = (path, args.json, args.write.given()) {
+        return Err(usage(format!(
+            "{option} is about a trace, and --json without -o writes none; give its name with -o"
+        )));
     }
+    let path = path.filter(|path| path.as_os_str() != "-");
+    let given = args.write.options(path.map_or(Some(Format::Candump), implied_format))?.format;
+    let format = match (given, path) {
+        (None, Some(path)) => Format::of_path(path)?,
+        (given, _) => given.unwrap_or(Format::Candump),
+    };
+    refuse_unwritten(format)?;
+    args.write.check_style(Some(format))?;
+    let Some(path) = path else { return Ok(()) };
     // Files of a series get numbers that are free.
     if args.write.rotate.is_empty() { refuse_older(path, args.force) } else { Ok(()) }
 }

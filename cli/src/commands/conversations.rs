@@ -16,13 +16,15 @@ pub use self::line::write;
 use self::lines::Lines;
 use self::summary::Summary;
 use crate::database_args::{DatabaseArgs, load};
-use crate::input::FollowArgs;
+use crate::input::{FollowArgs, of_a_trace};
 use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_a_trace),
+    after_help = "Examples:\n  \
                 cantap conversations drive.log\n  \
                 cantap conversations drive.blf --protocol uds --protocol obd --json\n  \
                 cantap conversations tractor.asc --db machine.dbc\n  \
@@ -35,7 +37,8 @@ use crate::protocols::{self, ProtocolArgs};
                 receiver, what was said, and for a response how long it took. Where frames were lost, what was under \
                 way says so. With --json each line is an object:\n\
                 {\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", \
-                …}, see docs/protocols.md. The last line is {\"summary\"}.")]
+                …}, see docs/protocols.md. The last line is {\"summary\"}."
+)]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]

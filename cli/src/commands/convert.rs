@@ -8,7 +8,7 @@ use anyhow::bail;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::Key;
 use cantap_formats::{
-    Columns, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
+    Columns, CsvDialect, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
 };
 use cantap_signals::named::NamedFilter;
 
@@ -20,6 +20,7 @@ use crate::database_args::DatabaseArgs;
 use crate::input::{FollowArgs, ReadArgs};
 use crate::range_args::RangeArgs;
 use crate::trace_output::{TraceOutput, named};
+use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::missing::by_kind;
 
@@ -64,7 +65,7 @@ pub struct Args {
     /// Make OUT a folder of Parquet files, in folders named after these, in this order: day, channel, or NAME=VALUE. Engines read
     /// it as one table. The files are named after IN: converting it again replaces them.
     #[cfg(feature = "parquet")]
-    #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with = "format")]
+    #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with_all = ["format", "rotate"])]
     partition: Vec<Key>,
     /// Print the numbers as a JSON object, to standard error if the trace goes to standard output.
     #[arg(long)]
@@ -84,18 +85,18 @@ pub struct WriteArgs {
     /// Keep only this many of these files: the oldest are deleted.
     #[arg(long, value_name = "N", requires = "rotate", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
-    /// The column separator of the earlier analyser's CSV.
-    #[arg(long, value_name = "CHARACTER", default_value = ";", value_parser = character)]
-    separator: u8,
-    /// The decimal mark of the earlier analyser's tables.
-    #[arg(long, value_name = "CHARACTER", default_value = ",", value_parser = character)]
-    decimal_mark: u8,
-    /// The line ends of the earlier analyser's tables.
-    #[arg(long, value_name = "END", default_value = "crlf", value_parser = ["crlf", "lf"])]
-    line_end: String,
-    /// What VECTORS counts in DIF, and whether V or an empty line follows a number: columns and V, or rows.
-    #[arg(long, value_name = "CONVENTION", default_value = "columns", value_parser = ["columns", "rows"])]
-    dif: String,
+    /// The column separator of the earlier analyser's CSV (csv-analyser), otherwise ;.
+    #[arg(long, value_name = "CHARACTER", value_parser = character)]
+    separator: Option<u8>,
+    /// The decimal mark of the earlier analyser's tables (csv-analyser, dif), otherwise a comma.
+    #[arg(long, value_name = "CHARACTER", value_parser = character)]
+    decimal_mark: Option<u8>,
+    /// The line ends of the earlier analyser's tables (csv-analyser, dif), otherwise crlf.
+    #[arg(long, value_name = "END", value_parser = ["crlf", "lf"])]
+    line_end: Option<String>,
+    /// What VECTORS counts in DIF, and whether V or an empty line follows a number: columns and V, otherwise so, or rows.
+    #[arg(long, value_name = "CONVENTION", value_parser = ["columns", "rows"])]
+    dif: Option<String>,
     /// The time zone of dates in files that do not name one, when reading or writing: Europe/Berlin, +02:00.
     #[arg(long, value_name = "ZONE", default_value_t)]
     pub zone: Zone,
@@ -114,15 +115,57 @@ fn character(text: &str) -> Result<u8, String> {
 impl WriteArgs {
     /// The library's options, with the format for a file whose name does not show it.
     pub fn options(&self, implied: Option<Format>) -> anyhow::Result<WriteOptions> {
-        if self.separator == self.decimal_mark {
-            bail!("the separator and the decimal mark are the same character; choose different ones");
+        let own = TableStyle::default();
+        let separator = self.separator.unwrap_or(own.separator);
+        let decimal_mark = self.decimal_mark.unwrap_or(own.decimal_mark);
+        if separator == decimal_mark {
+            return Err(usage(
+                "the separator and the decimal mark are the same character; choose different ones",
+            ));
         }
         let rotation = Rotation { at: self.rotate.clone(), keep: self.keep.map(|keep| keep as usize) };
-        let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
-        let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
-        let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
+        let line_end = if self.line_end.as_deref() == Some("lf") { LineEnd::Lf } else { LineEnd::CrLf };
+        let rows = self.dif.as_deref() == Some("rows");
+        let dif = if rows { DifConvention::Rows } else { DifConvention::Columns };
+        let table = TableStyle { separator, decimal_mark, line_end, dif };
         let format = self.format.or(implied);
         Ok(WriteOptions { format, rotation, table, zone: self.zone.clone(), ..WriteOptions::default() })
+    }
+}
+
+impl WriteArgs {
+    /// The first option that was given and means nothing unless a file is written.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.format.is_some(), "--format"),
+            (!self.rotate.is_empty(), "--rotate"),
+            (self.separator.is_some(), "--separator"),
+            (self.decimal_mark.is_some(), "--decimal-mark"),
+            (self.line_end.is_some(), "--line-end"),
+            (self.dif.is_some(), "--dif"),
+        ];
+        given.into_iter().find_map(|(given, option)| given.then_some(option))
+    }
+
+    /// Refuses options of tables for what is none: nothing of them would be in the file.
+    pub fn check_style(&self, format: Option<Format>) -> anyhow::Result<()> {
+        let (csv, dif) = (Format::Csv(CsvDialect::Analyser), Format::Dif);
+        let format = format.unwrap_or(Format::Candump);
+        for (given, option, of) in [
+            (self.separator.is_some(), "--separator", &[csv][..]),
+            (self.decimal_mark.is_some(), "--decimal-mark", &[csv, dif]),
+            (self.line_end.is_some(), "--line-end", &[csv, dif]),
+            (self.dif.is_some(), "--dif", &[dif]),
+        ] {
+            if given && !of.contains(&format) {
+                let of: Vec<_> = of.iter().map(|format| format!("--format {format}")).collect();
+                return Err(usage(format!(
+                    "{option} is of {}, and this is {format}; leave it out, or write that",
+                    of.join(" or ")
+                )));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -182,8 +225,11 @@ fn after_help() -> String {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
     let mut options = args.write.options(None)?;
-    if !args.is_columns()? {
+    if args.is_columns()? {
+        args.write.check_style(options.format.or(Some(Format::Parquet)))?;
+    } else {
         options = named(options, &args.output)?;
+        args.write.check_style(options.format)?;
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();

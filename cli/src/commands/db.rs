@@ -15,16 +15,20 @@ use crate::completion;
 use crate::input::ReadArgs;
 use crate::usage_error::usage;
 use cantap_work::terms::counted;
+use clap::Arg;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_coverage),
+    after_help = "Examples:\n  \
                 cantap db car.dbc\n  \
                 cantap db car.dbc --message EngineData --message 'Body*'\n  \
                 cantap db car.dbc --coverage trace.log\n  \
                 cantap db car.pdx\n\n\
                 In a layout the highest bit is on the left; < is a signal's most significant bit, x its least \
-                significant one, X a bit that several signals have.")]
+                significant one, X a bit that several signals have."
+)]
 pub struct Args {
     /// The databases, or descriptions of ECUs (PDX, ODX).
     #[arg(required = true, value_name = "FILE", add = completion::databases())]
@@ -47,6 +51,16 @@ pub struct Args {
     json: bool,
     #[command(flatten)]
     read: ReadArgs,
+}
+
+/// What says how to read a trace means nothing without one.
+fn of_coverage(arg: Arg) -> Arg {
+    match arg.get_id().as_str() {
+        "format" | "columns" | "strict" | "filter" | "zone" => {
+            arg.requires("coverage").conflicts_with_all(["messages", "warnings"])
+        }
+        _ => arg,
+    }
 }
 
 /// Runs it.

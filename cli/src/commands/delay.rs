@@ -18,7 +18,7 @@ use self::output::Output;
 use crate::args;
 use crate::database_args::DatabaseArgs;
 use crate::exit;
-use crate::input::{FollowArgs, Records};
+use crate::input::{FollowArgs, Records, of_a_trace};
 use crate::live_args::LiveArgs;
 use crate::usage_error::usage;
 
@@ -27,6 +27,7 @@ use crate::usage_error::usage;
 #[command(
     // In this command, --from is a channel.
     mut_arg("format", |format| format.long("format")),
+    mut_args(of_a_trace),
     after_help = "Frames are found again by identifier and data. The delay is from the end of a frame on one bus to its end on the other: it \
                   contains the frame's own length there, and its waiting for that bus. -f chooses among the frames of --from; of --to \
                   it only hides extra ones.\n\nExamples:\n  \
@@ -74,6 +75,11 @@ pub fn run(mut args: Args) -> anyhow::Result<ExitCode> {
     args.read.read.format_option = "--format";
     if args.from == args.to {
         return Err(usage("--from and --to are the same channel; name the two that the gateway connects"));
+    }
+    if let Some(channel) = [args.from, args.to].into_iter().find(|of| !args.live.channels().has(*of)) {
+        return Err(usage(format!(
+            "-c leaves out channel {channel}, which --from or --to names; leave -c out"
+        )));
     }
     if args.within > LONGEST {
         return Err(usage("--within is at most an hour"));

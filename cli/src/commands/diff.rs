@@ -14,17 +14,20 @@ use self::protocols::Protocols;
 use crate::database_args::DatabaseArgs;
 use crate::exit;
 use crate::input::ReadArgs;
-use crate::protocols::{Known, ProtocolArgs};
+use crate::protocols::{Known, ProtocolArgs, needs_protocols};
 use cantap_work::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(needs_protocols),
+    after_help = "Examples:\n  \
                 cantap diff before.log after.log\n  \
                 cantap diff good.blf bad.asc --tolerance 25 --json\n  \
                 cantap diff monday.log friday.log --protocols --eds drive.eds\n\n\
                 Bits are shown from the highest: 0 and 1 never changed in that trace, x did. Exit code: 0, also if the \
-                traces differ; with --check 3 if they do.")]
+                traces differ; with --check 3 if they do."
+)]
 pub struct Args {
     /// The first trace.
     a: PathBuf,

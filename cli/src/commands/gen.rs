@@ -22,6 +22,7 @@ use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 use cantap_work::sending::Sending;
+use cantap_work::terms::counted;
 use filled::Filled;
 
 /// Frames that leave this much later than their gap says are told: more than other frames on the bus explain at any common bit rate.
@@ -365,7 +366,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         object["channels"] = filled.object(device.hello().tick_hz);
         writeln!(std::io::stdout(), "{object}")?;
     } else {
-        eprint!("cantap: {} frames sent", sending.sent());
+        eprint!("cantap: {} sent", counted(sending.sent() as usize, "frame"));
         if accuracy.late_us >= WORTH_TELLING_US {
             eprint!(", up to {:.1} ms late: a busy bus or computer delays them", accuracy.late_us / 1e3);
         }

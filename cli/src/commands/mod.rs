@@ -153,6 +153,19 @@ pub enum Command {
 }
 
 impl Command {
+    /// Whether it is not done when Ctrl-C makes it fail. Others run until then.
+    pub const fn ends_by_itself(&self) -> bool {
+        matches!(
+            self,
+            Self::Autobaud(_)
+                | Self::Run(_)
+                | Self::Obd(_)
+                | Self::Uds(_)
+                | Self::Canopen(_)
+                | Self::J1939(_)
+        )
+    }
+
     /// Runs it. `line` describes the whole command.
     pub fn run(self, line: clap::Command) -> anyhow::Result<ExitCode> {
         match self {

@@ -32,7 +32,7 @@ use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::resolved;
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
-use crate::trace_output::{named, refuse_older};
+use crate::trace_output::{named, refuse_older, refuse_unwritten};
 use crate::usage_error::usage;
 
 /// The command line.
@@ -88,13 +88,16 @@ pub struct Args {
     /// With --once: write the screen to this file as an SVG picture instead, with its colours.
     #[arg(long, value_name = "FILE", requires = "once")]
     svg: Option<PathBuf>,
-    /// With --once: how long to watch a device.
-    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
-    time: Duration,
+    /// With --once: how long to watch a device, otherwise 1s.
+    #[arg(short = 't', long, value_name = "TIME", requires = "once", value_parser = args::positive_duration)]
+    time: Option<Duration>,
     /// With --once: the screen's size.
-    #[arg(long, value_name = "COLUMNSxROWS", default_value = "80x24", value_parser = size)]
+    #[arg(long, value_name = "COLUMNSxROWS", default_value = "80x24", requires = "once", value_parser = size)]
     size: (u16, u16),
 }
+
+/// How long --once watches a device.
+const WATCHED: Duration = Duration::from_secs(1);
 
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
@@ -160,7 +163,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         for remark in remarks {
             eprintln!("cantap: {remark}");
         }
-        let Once { screen, nothing_read } = once(origin, app, model, receiver, args.size, args.time)?;
+        let Once { screen, nothing_read } =
+            once(origin, app, model, receiver, args.size, args.time.unwrap_or(WATCHED))?;
         match &args.svg {
             None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
             Some(path) => atomic_file::write(path, svg(&screen).as_bytes())
@@ -193,6 +197,14 @@ impl Args {
                 "-c chooses a device's channels; of a trace's, -f can0,0:0 shows channel 1 alone",
             ));
         }
+        let of_devices =
+            [(self.normal, "--normal"), (self.time.is_some(), "-t")].into_iter().find(|(given, _)| *given);
+        if let Some(option) = of_devices.map(|(_, option)| option).or(self.open.given()) {
+            return Err(usage(format!(
+                "{option} is for a device, and {} is a trace; leave it out",
+                path.display()
+            )));
+        }
         Ok((Some(path.clone()), Vec::new()))
     }
 }
@@ -208,7 +220,7 @@ fn refuse_recording(args: &Args) -> anyhow::Result<()> {
     let Some(text) = args.output.as_deref() else { return Ok(()) };
     let (path, _) = parts(text);
     if path.extension().is_some() {
-        named(WriteOptions::default(), path)?;
+        named(WriteOptions::default(), path)?.format.map_or(Ok(()), refuse_unwritten)?;
     }
     refuse_older(path, args.force)
 }

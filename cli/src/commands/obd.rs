@@ -17,6 +17,7 @@ use cantap_protocols::{Event, EventKind, Value};
 
 use self::services::Services;
 use self::table::Table;
+use crate::keyboard::Keyboard;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
@@ -24,6 +25,9 @@ use cantap_work::code_texts::CodeTexts;
 use cantap_work::interrupt;
 use cantap_work::uds::{Client, TransferOptions};
 
+/// How often keys are looked for, and how many of them.
+const LOOK_FOR_KEYS: Duration = Duration::from_millis(100);
+const KEYS: usize = 64;
 /// Bits of a list of supported parameters.
 const LIST: u8 = 0x20;
 
@@ -77,7 +81,7 @@ enum What {
         #[command(flatten)]
         polling: Polling,
     },
-    /// Current values in a table on the terminal, with the least and the most so far, until Ctrl-C.
+    /// Current values in a table on the terminal, with the least and the most so far, until q or Ctrl-C.
     Watch {
         #[command(flatten)]
         polling: Polling,
@@ -115,6 +119,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.dtc.is_some() && args.speak.json {
         return Err(usage("--json has no lines for the texts of --dtc; leave one of them out"));
     }
+    if args.dtc.is_some() && !matches!(args.what, None | Some(What::Codes)) {
+        return Err(usage(
+            "--dtc has the texts of trouble codes, and this asks for none; cantap obd codes does, and cantap obd without a command",
+        ));
+    }
     let texts = args.dtc.as_deref().map(code_texts).transpose()?;
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
@@ -125,6 +134,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         is_extended: false,
         texts,
         table: None,
+        keyboard: None,
         servers: Vec::new(),
     };
     vehicle.find()?;
@@ -172,7 +182,9 @@ fn codes_of(event: &Event) -> impl Iterator<Item = String> + '_ {
         Value::Text(text) => Some(text.split(", ")),
         _ => None,
     });
-    lists.flatten().filter_map(|code| code.split(' ').next().map(str::to_owned))
+    let names = lists.flatten().filter_map(|code| code.split(' ').next());
+    // A list of none is an empty text.
+    names.filter(|name| !name.is_empty()).map(str::to_owned)
 }
 
 /// How to address all ECUs.
@@ -216,6 +228,8 @@ struct Vehicle<'d> {
     texts: Option<CodeTexts>,
     /// Takes the answers, if they are not printed one by one.
     table: Option<Table>,
+    /// Where the table is left by a key.
+    keyboard: Option<Keyboard>,
     servers: Vec<Server>,
 }
 
@@ -298,6 +312,7 @@ impl Vehicle<'_> {
     /// Shows values in a table that stays where it is on a terminal. Elsewhere, and for scripts, answers are lines as in [`Self::live`].
     fn watch(&mut self, polling: &Polling, is_json: bool) -> anyhow::Result<()> {
         self.table = (!is_json && std::io::stdout().is_terminal()).then(Table::default);
+        self.keyboard = self.table.as_ref().and_then(|_| Keyboard::open());
         let mut shown = 0;
         self.live(polling, &mut |table| {
             let (columns, rows) = screen();
@@ -344,7 +359,9 @@ impl Vehicle<'_> {
             }
             rounds += 1;
             if count.is_none_or(|count| rounds < count) {
-                self.client.speaking.listen((*period * rounds).saturating_sub(started.elapsed()))?;
+                if self.is_left_by((*period * rounds).saturating_sub(started.elapsed()))? {
+                    break;
+                }
             }
         }
         // Before the end of the first round, Ctrl-C is why.
@@ -353,6 +370,22 @@ impl Vehicle<'_> {
             bail!("no ECU has ever answered {}; {}", silent.join(", "), self.client.speaking.circumstances());
         }
         Ok(())
+    }
+
+    /// Listens for this long; returns whether the user wants no more.
+    fn is_left_by(&mut self, mut left: Duration) -> anyhow::Result<bool> {
+        loop {
+            let now = if self.keyboard.is_some() { left.min(LOOK_FOR_KEYS) } else { left };
+            self.client.speaking.listen(now)?;
+            left -= now;
+            let keys = std::iter::from_fn(|| self.keyboard.as_mut()?.next());
+            if interrupt::requested() || keys.take(KEYS).any(|key| key == 'q') {
+                return Ok(true);
+            }
+            if left.is_zero() {
+                return Ok(false);
+            }
+        }
     }
 
     fn all_pids(&self) -> Vec<u8> {

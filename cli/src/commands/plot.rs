@@ -53,14 +53,14 @@ pub struct Args {
     #[arg(long, value_name = "ID", conflicts_with = "signals", value_parser = grammar::identifier, add = completion::identifiers())]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", add = completion::bit_rates())]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", conflicts_with_all = ["signals", "timing"], add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
     /// The bit rate of the data phase of CAN FD frames that switch, such as 2M, or 2:5M for one channel. Without it, the load of windows with
     /// such frames is not known.
     #[arg(long = "data-bitrate", value_name = "[CHANNEL:]RATE", requires = "bitrates", add = completion::bit_rates())]
     data_bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
-    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
+    #[arg(short, long, value_name = "TIME", default_value = "1s", requires = "bus_load", conflicts_with_all = ["signals", "timing"], value_parser = args::positive_duration)]
     window: Duration,
     /// The file to write: .svg, .png or .html.
     #[arg(short, long, value_name = "FILE")]
@@ -74,7 +74,7 @@ pub struct Args {
     #[arg(long = "y", value_name = "LOW:HIGH", value_parser = vertical, allow_hyphen_values = true)]
     vertical: Option<(f64, f64)>,
     /// Draw at most this many signals.
-    #[arg(long, value_name = "N", default_value_t = MOST_CURVES)]
+    #[arg(long, value_name = "N", default_value_t = MOST_CURVES, conflicts_with_all = ["bus_load", "timing"])]
     curves: usize,
     /// Title; default: the trace's name.
     #[arg(long)]

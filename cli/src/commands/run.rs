@@ -195,6 +195,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 impl Args {
     fn bench(&self, decoder: Arc<cantap_signals::Decoder>) -> anyhow::Result<Bench> {
+        if let Some(option) = self.open.given() {
+            return Err(usage(format!(
+                "{option} is for a device, and these buses are simulated; give one with -d"
+            )));
+        }
         let timing = self.open.options().timing;
         if timing.has_auto() {
             return Err(usage(

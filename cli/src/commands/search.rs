@@ -18,7 +18,7 @@ use super::decode;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::exit;
-use crate::input::{FollowArgs, Records, not_a_message};
+use crate::input::{FollowArgs, Records, not_a_message, of_a_trace};
 use crate::live_args::LiveArgs;
 use crate::protocols::{self, ProtocolArgs};
 use crate::range_args::RangeArgs;
@@ -30,7 +30,9 @@ use cantap_work::terms::failure_text;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_a_trace),
+    after_help = "Examples:\n  \
                 cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
                 cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
                 cantap search trace.blf --data '* DE AD' -o found.asc\n  \
@@ -42,7 +44,8 @@ use cantap_work::terms::failure_text;
                 >=, not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == \
                 5 and canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it \
                 what it says.\n\n\
-                Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
+                Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line."
+)]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
@@ -79,13 +82,13 @@ pub struct Args {
     #[arg(short, long, value_name = "N")]
     max_count: Option<u64>,
     /// Print only the number found.
-    #[arg(long, conflicts_with_all = ["output", "json"])]
+    #[arg(long, conflicts_with_all = ["output", "json", "written_format"])]
     count: bool,
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
     /// The format to write, if the output's name does not show it.
-    #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
+    #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", conflicts_with = "json", add = completion::written_formats())]
     written_format: Option<Format>,
     /// Print one JSON object per record, followed by one with the summary.
     #[arg(long)]

@@ -5,6 +5,7 @@ mod replies;
 mod timed;
 
 use std::io::Write;
+use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -13,6 +14,7 @@ use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
 use cantap::wire::message::{DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, Trigger};
 use cantap::{Channel, Device, Frame, Id, TraceFrame, hw_filter};
+use cantap_address::Address;
 use cantap_signals::named::NamedFilter;
 use cantap_signals::{Decoder, encode};
 use cantap_trace::grammar;
@@ -97,7 +99,9 @@ pub struct Args {
 /// A channel; a frame in its place shows that it was forgotten.
 fn channel(text: &str) -> Result<Channel, String> {
     args::channel(text).map_err(|reason| {
-        if text.contains(['#', ':']) {
+        if Address::is_meant_by(Path::new(text)) {
+            format!("a device is given with -d, and the channel follows, as in: cantap send -d {text} 1")
+        } else if text.contains(['#', ':']) {
             format!("say on which channel before the frame, as in: cantap send 1 {text}")
         } else {
             reason
@@ -122,6 +126,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let classic: Vec<Frame> = frames.iter().filter_map(|frame| frame.classic().copied()).collect();
     let has_fd = classic.len() < frames.len();
+    let switches = |(source, text): (&Source, &String)| is_message(text) && source.first.classic().is_none();
+    if args.brs && !sources.iter().zip(&args.frames).any(switches) {
+        return Err(usage(
+            "--brs is for CAN FD frames made from a database's messages of more than eight bytes, and none of these is one; in a frame, the \
+             digit behind ## says it, as in 123##1DEADBEEF",
+        ));
+    }
     if has_fd && (args.reply || args.on_rx.is_some()) {
         return Err(usage("a reply is a classical frame; give one, as in 123#1122"));
     }

@@ -17,9 +17,9 @@ use self::windows::Windows;
 use crate::args;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
-use crate::input::{FollowArgs, filtered};
+use crate::input::{FollowArgs, filtered, needs_a_trace, of_a_trace};
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
-use crate::protocols::{Known, ProtocolArgs};
+use crate::protocols::{Known, ProtocolArgs, needs_protocols};
 use crate::range_args::RangeArgs;
 use crate::usage_error::usage;
 use cantap_work::channel_bitrate::ChannelBitrate;
@@ -30,7 +30,11 @@ use cantap_work::timing_options::TimingOptions;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_a_trace),
+    mut_args(needs_protocols),
+    mut_arg("strict", needs_a_trace),
+    after_help = "Examples:\n  \
                 cantap stats trace.log -b 500k\n  \
                 cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
                 cantap stats fd.asc -b 500k --data-bitrate 2M\n  \
@@ -38,7 +42,8 @@ use cantap_work::timing_options::TimingOptions;
                 cantap stats workshop.log --protocols\n\n\
                 A frame's load is its exact length, stuff bits and intermission included, over the time since the frame \
                 before. Windows also count error frames, with their minimum length. Where frames were lost, the load is \
-                a lower bound and says so.")]
+                a lower bound and says so."
+)]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
@@ -60,7 +65,7 @@ pub struct Args {
         add = completion::bit_rates()
     )]
     data_bitrates: Vec<ChannelBitrate>,
-    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which means all.
+    /// The channels, of the device or in the file: 1, 2, several as 1,3, or both, which means all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: Channels,
     /// How long to listen.
@@ -116,6 +121,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let names =
         if args.input.is_some() { args.databases.options() } else { args.databases.or_of(&args.device) };
     let filters = args.read.filters(&load(&names, false, true)?)?;
+    // Before a device is touched.
+    Statistics::new(args.options()).map_err(|error| usage(error.to_string()))?;
     let live = if args.input.is_some() {
         if args.timing().has_auto() {
             return Err(usage(AUTO_NEEDS_A_DEVICE));
@@ -137,7 +144,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         options.filtered = live.filtered();
     }
     options.filtered.extend(filtered(&filters));
-    let mut statistics = Statistics::new(options)?;
+    let mut statistics = Statistics::new(options).map_err(|error| usage(error.to_string()))?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
     let mut known = args.protocols.then(|| args.protocol.known(args.json)).transpose()?;
     let mut ended = Ok(());
@@ -147,7 +154,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         // What was received is shown, but it is a failure if there were only errors.
         ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
-        let mut records = args.read.open(path, filters)?.within(range)?;
+        let mut records = args.read.open(path, filters)?.of_channels(&args.channel).within(range)?;
         let mut closed = |window: &_| {
             if let Some(windows) = &mut windows {
                 windows.push(window);

@@ -12,6 +12,7 @@ use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 use cantap_work::reading::Reading;
+use clap::Arg;
 
 pub use self::known::{Known, named};
 pub use self::odx::{OdxPath, is_odx, load as load_odx, read as read_odx};
@@ -56,6 +57,14 @@ impl ProtocolArgs {
         let mut pairs = self.pairs.clone();
         pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
         Ok(Options { pairs, sheets, descriptions, ..Options::default() })
+    }
+}
+
+/// [`ProtocolArgs`] mean something with `--protocols` only. For `Command::mut_args` of a command that has it.
+pub fn needs_protocols(arg: Arg) -> Arg {
+    match arg.get_id().as_str() {
+        "pairs" | "sheets" | "odx" => arg.requires("protocols"),
+        _ => arg,
     }
 }
 

@@ -253,6 +253,7 @@ fn made_up_frames_come_at_their_gap() {
     let (code, out, err) = cantap(&format!("{line} -v"));
     assert!(code == Some(0) && err.starts_with("cantap: 5 frames sent"), "{err}");
     assert_eq!(frames(&out)[4], "can1 42A#04 T");
+    assert!(cantap("gen -d virtual:load=0 can1 -g 0 -n 1").2.starts_with("cantap: 1 frame sent"));
     // The device's stamps: a tick's rounding.
     assert_eq!(in_time(line, 0.2)["sent"], 5);
     let (code, _, err) = cantap("gen -d virtual:ack=no,load=0 can0 -g 0 -n 10");

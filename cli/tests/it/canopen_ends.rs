@@ -35,7 +35,7 @@ fn ctrl_c_aborts_a_transfer_and_the_node_is_told() {
     interrupt(&reader);
     let output = reader.wait_with_output().unwrap();
     let error = String::from_utf8(output.stderr).unwrap();
-    assert!(output.status.code() == Some(1) && error.contains("ended by Ctrl-C"), "{error}");
+    assert!(output.status.code() == Some(130) && error.contains("ended by Ctrl-C"), "{error}");
     interrupt(&listener);
     listener.wait().unwrap();
     served.server.kill().unwrap();

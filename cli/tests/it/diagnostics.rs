@@ -70,6 +70,10 @@ fn trouble_codes_have_the_texts_of_the_user_s_table() {
     std::fs::write(&path, "code,text\nP0128,\"Coolant below the thermostat's temperature\"\n").unwrap();
     let out = well(&format!("obd -d virtual:car codes --dtc {at}"));
     assert!(out.contains("P0128     Coolant below the thermostat's temperature"), "{out}");
+    // An ECU without codes has none that the table might not have.
+    assert!(!out.contains("(not in the table)"), "{out}");
+    let out = well(&format!("obd -d virtual:car --dtc {at}"));
+    assert!(out.contains("P0128     Coolant below the thermostat's temperature"), "{out}");
     std::fs::write(&path, "P0001,Another\n").unwrap();
     assert!(well(&format!("obd -d virtual:car codes --dtc {at}")).contains("P0128     (not in the table)"));
     std::fs::write(&path, "P0001,Another\nP00\n").unwrap();
@@ -245,6 +249,9 @@ fn a_watched_table_is_drawn_over_the_one_before() {
     view.resize((40, 4));
     let text = view.wait_for("2 more: ");
     assert!(text.lines().all(|line| line.chars().count() <= 40), "{text}");
-    view.keys("\u{3}");
+    // The value is there, and the name is shorter.
+    let engine = text.lines().find(|line| line.starts_with("0C   engine")).unwrap_or_default();
+    assert!(engine.contains(" rpm"), "{text}");
+    view.keys("q");
     assert_eq!(view.end(), 0);
 }

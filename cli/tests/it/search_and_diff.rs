@@ -167,3 +167,26 @@ fn differences_are_listed() {
     );
     assert_eq!(cantap("diff", &["diff", "a.log", "a.log", "--check"]).0, Some(0));
 }
+
+#[test]
+fn a_channel_of_a_trace_is_chosen_as_in_convert() {
+    let folder = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("search_and_diff/channels");
+    std::fs::create_dir_all(&folder).unwrap();
+    let line = |at: usize| format!("({at}.000000) can{} 001#{at:02X}\n", at % 2);
+    std::fs::write(folder.join("both.log"), (0..10).map(line).collect::<String>()).unwrap();
+    let run = |line: &str| cantap("channels", &line.split(' ').collect::<Vec<_>>());
+    assert_eq!(run("convert both.log second.log -c 2").0, Some(0));
+    for line in [
+        "search {} --id 001",
+        "decode {} --db car.dbc",
+        "stats {} --json",
+        "conversations {}",
+        "stats {} --per-id",
+    ] {
+        let second = run(&line.replace("{}", "second.log"));
+        assert_eq!(run(&format!("{} -c 2", line.replace("{}", "both.log"))), second, "{line}");
+        assert_ne!(run(&line.replace("{}", "both.log")), second, "{line}");
+    }
+    assert_eq!(run("search both.log --id 001 -c 9"), (Some(1), String::new(), String::new()));
+    assert_eq!(run("delay both.log --from 1 --to 2 -c 1,2"), run("delay both.log --from 1 --to 2"));
+}

@@ -173,3 +173,55 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
     let (code, out, err) = cantap(&format!("search {TRACE} --id 9F80102 --count"));
     assert!(code == Some(0) && out.trim() != "0", "{err}{out}");
 }
+
+/// What is asked for and cannot be had is refused, and not ignored: nothing is opened.
+#[test]
+fn options_that_mean_nothing_there_are_refused() {
+    let alone = "cannot be used with";
+    for (line, part) in [
+        ("search {trace} --id 1 -t 1s", alone),
+        ("decode {trace} --protocols -b 500k", alone),
+        ("conversations {trace} -t 1s", alone),
+        ("delay {trace} --from 1 --to 2 -b 500k", alone),
+        ("delay {trace} --from 1 --to 2 -c 1", "-c leaves out channel 2"),
+        ("search --id 1 --follow -t 1s", alone),
+        ("stats -d virtual:car --follow", alone),
+        ("stats -d virtual:car --strict", alone),
+        ("stats -d virtual:car --zone UTC", alone),
+        ("conversations -d virtual:car --zone UTC", alone),
+        ("stats --zone UTC", "<FILE>"),
+        ("search {trace} --id 1 --count --format asc", alone),
+        ("stats {trace} --pair 7E0:7E8", "--protocols"),
+        ("diff {trace} {trace} --pair 7E0:7E8", "--protocols"),
+        ("decode {trace} --protocols --text-cells", "add --csv"),
+        ("db no.dbc --strict", "--coverage"),
+        ("db no.dbc --message A -f 1", alone),
+        ("plot {trace} --db no.dbc -s A -b 500k", alone),
+        ("plot {trace} --db no.dbc -w 1s", "--bus-load"),
+        ("plot {trace} --timing 123 --curves 3", alone),
+        ("monitor {trace} --once --normal", "--normal is for a device"),
+        ("monitor {trace} --once --mode normal", "--mode is for a device"),
+        ("monitor {trace} --once -t 1s", "-t is for a device"),
+        ("monitor {trace} --once --btr 1", "--btr is for a device"),
+        ("monitor virtual:car -t 1s", "--once"),
+        ("obd -d virtual:car live --dtc no.csv", "cantap obd codes does"),
+        ("send -d virtual 1 123#00 --brs", "123##1DEADBEEF"),
+        ("run node:engine --one-shot --for 1ms", "--one-shot is for a device"),
+        ("capture -d virtual -b 1M -o no.log --decimal-mark .", "--format csv-analyser or --format dif"),
+        ("capture -d virtual -b 1M --json --format asc", "with -o"),
+        ("capture -d virtual -b 1M -o no.parquet", "cantap convert"),
+        ("capture -d virtual -b 1M --format rlog", "only read"),
+        ("convert {trace} no.log --dif rows", "--format dif"),
+        ("convert {trace} no.csv --format csv-analyser --separator ,", "choose different ones"),
+        ("align {trace} {trace} --format asc", "with -o"),
+        ("stats {trace} --window 1us", "a window must be longer"),
+        ("stats {trace} --window 99999999999999d", "a year"),
+        ("capture virtual:car", "-d virtual:car"),
+        ("obd codes virtual:car", "-d virtual:car"),
+        ("send virtual:car 1 123#00", "-d virtual:car"),
+    ] {
+        let (code, out, err) = cantap(&line.replace("{trace}", TRACE));
+        assert!(code == Some(2) && err.contains(part) && out.is_empty(), "{line}: {code:?} {out}{err}");
+    }
+    assert!(!std::path::Path::new("no.log").exists() && !std::path::Path::new("no.parquet").exists());
+}

@@ -9,14 +9,17 @@ use cantap_columns::parquet::Key;
 use crate::args;
 use crate::completion;
 use crate::database_args::DatabaseArgs;
-use crate::input::FollowArgs;
+use crate::input::{FollowArgs, of_a_trace};
 use crate::live_args::LiveArgs;
-use crate::protocols::ProtocolArgs;
+use crate::protocols::{ProtocolArgs, needs_protocols};
 use crate::range_args::RangeArgs;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Examples:\n  \
+#[command(
+    mut_args(of_a_trace),
+    mut_args(needs_protocols),
+    after_help = "Examples:\n  \
                 cantap decode --db car.dbc trace.log\n  \
                 cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' \\\n      \
                 --signal 'Engine.*' --csv\n  \
@@ -31,7 +34,8 @@ use crate::range_args::RangeArgs;
                 is none: a float that is not a number, or J1939's error or not available). With --details each signal \
                 is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have. With --protocols, \
                 what was said has also protocol, from and to. The last line is {\"summary\"}: how much there was, was \
-                decoded, and could not be read.")]
+                decoded, and could not be read."
+)]
 pub struct Args {
     #[command(flatten)]
     pub databases: DatabaseArgs,

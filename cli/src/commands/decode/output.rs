@@ -89,6 +89,9 @@ impl Form {
                 "--wide and --resample make tables; add --csv, or -o with a name that ends in .csv or .parquet",
             ));
         }
+        if args.text_cells && form != Self::Csv {
+            return Err(usage("--text-cells is about CSV; add --csv, or -o with a name that ends in .csv"));
+        }
         #[cfg(feature = "parquet")]
         if form == Self::Parquet && args.protocols && !args.wide && args.resample.is_none() {
             return Err(usage(

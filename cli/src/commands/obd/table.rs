@@ -15,6 +15,13 @@ const READ_BY_IDENTIFIER: u8 = 0x22;
 const VEHICLE_INFORMATION: u8 = 0x09;
 /// Columns between two.
 const GAP: &str = "  ";
+/// Where the name and the value are.
+const NAME: usize = 1;
+const VALUE: usize = 3;
+/// Columns of a name that still shows what it is; the least and the most so far give way to it.
+const SHORT_NAME: usize = 16;
+/// Its heading.
+const SHORTEST_NAME: usize = 4;
 
 /// One value of one ECU.
 #[derive(Clone, Debug, PartialEq)]
@@ -110,8 +117,8 @@ impl Table {
         self.rows.is_empty()
     }
 
-    /// The table's lines, none longer than `columns`; with the least and the most so far if `with_range`. If there are more than `lines`, the last
-    /// one says how many are missing.
+    /// The table's lines, none longer than `columns`; with the least and the most so far if `with_range`. In a narrow window names are shorter, and
+    /// where that is not enough, the least and the most are left out. If there are more than `lines`, the last line says how many are missing.
     pub fn lines(&self, with_range: bool, (columns, lines): (usize, usize)) -> Vec<String> {
         let mut rows: Vec<&Row> = self.rows.iter().collect();
         rows.sort_by(|a, b| a.order().cmp(&b.order()));
@@ -134,12 +141,21 @@ impl Table {
             cells.push(line);
         }
         let width = |column: usize| cells.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: Vec<usize> = (0..cells[0].len()).map(width).collect();
+        let mut widths: Vec<usize> = (0..cells[0].len()).map(width).collect();
+        let without_name = |widths: &[usize]| {
+            let all: usize = widths.iter().map(|width| width + GAP.len()).sum();
+            all - GAP.len() - widths[NAME]
+        };
+        // What is measured now matters most, and then what it is.
+        if without_name(&widths) + widths[NAME].min(SHORT_NAME) > columns {
+            widths.truncate(VALUE + 1);
+        }
+        widths[NAME] = widths[NAME].min(columns.saturating_sub(without_name(&widths)).max(SHORTEST_NAME));
         let line = |row: &Vec<String>| {
             let mut line = String::new();
             for (cell, width) in row.iter().zip(&widths) {
                 // Writing to a String cannot fail.
-                let _ = write!(line, "{cell:<width$}{GAP}");
+                let _ = write!(line, "{:<width$}{GAP}", cut(cell, *width));
             }
             cut(line.trim_end(), columns)
         };
@@ -240,6 +256,16 @@ mod tests {
         assert_eq!(table.lines(false, ROOM)[1], "0C   engine_speed  7E8  800.123 rpm");
     }
 
+    #[test]
+    fn in_a_narrow_window_names_are_cut_and_values_are_not() {
+        let mut table = table(&[("0C", 1234.5)]);
+        let name = "catalyst_temperature_bank_1_sensor_1".to_owned();
+        table.put(Row { name, value: "no answer, was 512.3 °C".to_owned(), ..row("3C", 512.3, 0) });
+        let lines = table.lines(true, (70, 24));
+        assert_eq!(lines[2], "3C   catalyst_temperatu…  7E8  no answer, was 512.3 °C  512.3   512.3");
+        assert_eq!(table.lines(true, (40, 24))[2], "3C   cata…  7E8  no answer, was 512.3 °C");
+    }
+
     /// A value must not stand there as if the ECU still told it.
     #[test]
     fn what_is_not_answered_any_more_is_shown_as_such() {
@@ -259,8 +285,8 @@ mod tests {
         let starts: Vec<String> =
             table.lines(false, ROOM).iter().map(|line| line[..6].trim().to_owned()).collect();
         assert_eq!(starts, ["PID", "09 02", "", "0C", "0D"]);
-        let narrow = table.lines(false, (20, 24));
-        assert!(narrow.iter().all(|line| line.chars().count() == 20 && line.ends_with('…')), "{narrow:?}");
+        let narrow = table.lines(false, (10, 24));
+        assert!(narrow.iter().all(|line| line.chars().count() == 10 && line.ends_with('…')), "{narrow:?}");
         let low = table.lines(false, (100, 3));
         assert!(low.len() == 3 && low[2].starts_with("3 more: "), "{low:?}");
     }

@@ -225,7 +225,16 @@ impl Commands {
         self.emptying = [Emptying::No; CHANNELS];
         self.end_measurement(work, board);
         #[cfg(any(feature = "disturb", not(target_os = "none")))]
-        disturb::end(work, board);
+        match work {
+            Work::Open(channel, _) | Work::Close(channel) | Work::Recover(channel) => {
+                disturb::leave(&[channel], board);
+            }
+            Work::Retreat => {
+                disturb::leave(&Channel::ALL, board);
+                disturb::lock(board);
+            }
+            Work::Keep | Work::Silence | Work::Restart | Work::Bootloader => disturb::lock(board),
+        }
         match work {
             // A restart in the middle of a frame would destroy it for everyone on the bus.
             Work::Silence | Work::Restart | Work::Bootloader => {

@@ -7,6 +7,7 @@ mod doors;
 mod keys;
 mod other_doors;
 mod upkeep;
+mod way;
 mod web_door;
 
 use std::io::{self, Read, Write};
@@ -34,6 +35,7 @@ use self::doors::numbered;
 use self::doors::{Allowed, Door, TunnelArg, address, allow, allowed, loopback, tunnel};
 use self::other_doors::OtherDoors;
 use self::upkeep::Upkeep;
+use self::way::Way;
 use self::web_door::WebDoor;
 use crate::args;
 use crate::database_args::DatabaseArgs;
@@ -199,7 +201,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut timing = TimingOptions::default();
     timing.set_bit_rates(args.bitrates.clone());
     timing.check_channels(addresses.len())?;
-    let way = Way::of(args)?;
+    let way = way(args)?;
     let tcp = args.tcp.as_deref().map(|text| match way {
         Way::Plain => loopback(text, PORT),
         #[cfg(feature = "tls")]
@@ -418,50 +420,18 @@ fn listen(
     Ok((ways, encrypted))
 }
 
-/// How clients are admitted at a TCP port.
-enum Way {
-    /// Without authentication.
-    Plain,
-    /// By certificate.
-    #[cfg(feature = "tls")]
-    Encrypted(cantap_serve::tls::Server),
+/// As the options have it.
+#[cfg(feature = "tls")]
+fn way(args: &Args) -> anyhow::Result<Way> {
+    let (Some(files), Some(authority)) = (&args.tls, &args.clients) else { return Ok(Way::Plain) };
+    keys::server(files, authority, args.revoked.as_deref()).map(Way::Encrypted)
 }
 
-impl Way {
-    #[cfg(feature = "tls")]
-    fn of(args: &Args) -> anyhow::Result<Self> {
-        let (Some(files), Some(authority)) = (&args.tls, &args.clients) else { return Ok(Self::Plain) };
-        keys::server(files, authority, args.revoked.as_deref()).map(Self::Encrypted)
-    }
-
-    #[cfg(not(feature = "tls"))]
-    #[expect(clippy::unnecessary_wraps, reason = "as with TLS")]
-    const fn of(_args: &Args) -> anyhow::Result<Self> {
-        Ok(Self::Plain)
-    }
-
-    /// What is read again at a hang-up.
-    #[cfg(feature = "tls")]
-    fn server(&self) -> Option<cantap_serve::tls::Server> {
-        if let Self::Encrypted(server) = self { Some(server.clone()) } else { None }
-    }
-
-    /// The scheme in addresses.
-    const fn scheme(&self) -> &'static str {
-        match self {
-            Self::Plain => "tcp",
-            #[cfg(feature = "tls")]
-            Self::Encrypted(_) => "tls",
-        }
-    }
-
-    fn listen(&self, board: &Arc<Board>, address: SocketAddr, most: Role) -> io::Result<Listening> {
-        match self {
-            Self::Plain => listen::tcp(board, address, most),
-            #[cfg(feature = "tls")]
-            Self::Encrypted(server) => cantap_serve::tls::listen(board, address, most, server),
-        }
-    }
+/// As the options have it.
+#[cfg(not(feature = "tls"))]
+#[expect(clippy::unnecessary_wraps, reason = "as with TLS")]
+const fn way(_args: &Args) -> anyhow::Result<Way> {
+    Ok(Way::Plain)
 }
 
 /// Serves the client at the other end of standard input and output until that is closed.

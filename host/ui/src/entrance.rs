@@ -7,24 +7,11 @@ use tungstenite::handshake::derive_accept_key;
 use tungstenite::protocol::Role;
 
 use crate::head::{self, BadHead, Head};
-use crate::session::{self, Session};
-use crate::shared::{Page, Shared};
+use crate::session::{self, Live, Session};
+use crate::shared::Page;
 use crate::site::Site;
-use crate::stream::Stream;
+use crate::stream::Connection;
 use crate::visits::{Visit, Visitor, Visits};
-
-/// A connection on which something is answered.
-pub type Connection = Box<dyn Stream>;
-
-/// The session that a page wants to see.
-pub struct Live<'a> {
-    pub shared: &'a Shared,
-    /// The name of its run, so that a page knows whether its place in the records is still one.
-    pub run: &'a str,
-    pub visits: &'a Visits,
-    /// Whether the page may still be there; an error says why not.
-    pub check: &'a dyn Fn() -> Result<(), String>,
-}
 
 /// Reads a request. `None` if there is none; whoever runs the server and the other side have been told why.
 pub fn request(stream: &mut Connection, name: &str, visits: &Visits) -> io::Result<Option<Head>> {

@@ -15,11 +15,13 @@ use cantap_work::report::Reporter;
 use crate::access::{self, Door, Token};
 use crate::bus::Bus;
 use crate::device::Device;
-use crate::entrance::{self, Connection, Live};
+use crate::entrance;
 use crate::head;
 use crate::server::MOST_PAGES;
+use crate::session::Live;
 use crate::shared::Shared;
 use crate::site::Site;
+use crate::stream::Connection;
 use crate::visits::{Visit, Visitor, Visits};
 
 /// Sessions at a time: each keeps what its devices received for its pages.

@@ -17,10 +17,12 @@ use crate::access::{self, Door, Refusal, Token};
 use crate::bus::Bus;
 use crate::connections::Connections;
 use crate::device::Device;
-use crate::entrance::{self, Connection, Live};
+use crate::entrance;
 use crate::head::{self, Head};
+use crate::session::Live;
 use crate::shared::Shared;
 use crate::site::Site;
+use crate::stream::Connection;
 use crate::visits::{Visit, Visitor, Visits};
 
 /// Pages at a time.

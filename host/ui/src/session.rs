@@ -17,10 +17,9 @@ use tungstenite::protocol::{CloseFrame, WebSocketConfig, frame::coding::CloseCod
 use tungstenite::{Error, Message as Frame, WebSocket};
 
 use crate::backlog::Cursor;
-use crate::entrance::{Connection, Live};
 use crate::request::Message;
 use crate::shared::{Answer, Shared};
-use crate::stream::is_idle;
+use crate::stream::{Connection, is_idle};
 use crate::visits::{Visit, Visitor, Visits};
 
 /// How often what has arrived is passed on: as often as a screen is drawn.
@@ -37,6 +36,16 @@ const MOST_WAITING: usize = 16;
 const PING_EVERY: Duration = Duration::from_secs(1);
 /// A page that shows nothing for this long has gone.
 const GONE_AFTER: Duration = Duration::from_secs(20);
+
+/// The session with devices that a page wants to see.
+pub struct Live<'a> {
+    pub shared: &'a Shared,
+    /// The name of its run, so that a page knows whether its place in the records is still one.
+    pub run: &'a str,
+    pub visits: &'a Visits,
+    /// Whether the page may still be there; an error says why not.
+    pub check: &'a dyn Fn() -> Result<(), String>,
+}
 
 /// A page that is served.
 pub struct Session<'a> {

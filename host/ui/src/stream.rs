@@ -25,3 +25,6 @@ impl Stream for TcpStream {
 pub(crate) fn is_idle(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted)
 }
+
+/// A connection on which something is answered.
+pub type Connection = Box<dyn Stream>;

@@ -2,7 +2,6 @@
 
 use cantap_wire::{Channel, Refusal, Reply};
 
-use super::Work;
 use crate::port::board::Board;
 
 pub(super) fn unlock<'q, const N: usize>(word: u32, board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
@@ -23,18 +22,16 @@ pub(super) fn plan<'q, const N: usize>(
     planned.unwrap_or(Err(Refusal::Unsupported)).map(|()| Reply::Done)
 }
 
-/// Work begins that takes channels off their buses, or ends the session.
-pub(super) fn end<'q, const N: usize>(work: Work, board: &mut impl Board<'q, N>) {
-    board.with_disturber(|disturber, pulse, capture, clock| match work {
-        Work::Open(channel, _) | Work::Close(channel) | Work::Recover(channel) => {
-            disturber.leave(channel, pulse, capture, clock);
+/// Channels are about to leave their buses.
+pub(super) fn leave<'q, const N: usize>(channels: &[Channel], board: &mut impl Board<'q, N>) {
+    board.with_disturber(|disturber, pulse, capture, clock| {
+        for channel in channels {
+            disturber.leave(*channel, pulse, capture, clock);
         }
-        Work::Retreat => {
-            for channel in Channel::ALL {
-                disturber.leave(channel, pulse, capture, clock);
-            }
-            disturber.lock(pulse);
-        }
-        Work::Keep | Work::Silence | Work::Restart | Work::Bootloader => disturber.lock(pulse),
     });
+}
+
+/// The session is about to end.
+pub(super) fn lock<'q, const N: usize>(board: &mut impl Board<'q, N>) {
+    board.with_disturber(|disturber, pulse, _, _| disturber.lock(pulse));
 }

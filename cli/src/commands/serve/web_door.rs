@@ -15,8 +15,8 @@ use cantap_ui::{People, Person};
 use cantap_work::boards::Boards;
 use cantap_work::channel_options::ChannelOptions;
 
-use super::Way;
 use super::doors::{Allowed, Door, address, allow};
+use super::way::Way;
 use crate::commands::ui::DEAD_MAN;
 use crate::database_args::{DatabaseArgs, load};
 use crate::page;

@@ -358,10 +358,10 @@ impl Vehicle<'_> {
                 round(table)?;
             }
             rounds += 1;
-            if count.is_none_or(|count| rounds < count) {
-                if self.is_left_by((*period * rounds).saturating_sub(started.elapsed()))? {
-                    break;
-                }
+            if count.is_none_or(|count| rounds < count)
+                && self.is_left_by((*period * rounds).saturating_sub(started.elapsed()))?
+            {
+                break;
             }
         }
         // Before the end of the first round, Ctrl-C is why.

@@ -99,7 +99,8 @@ pub struct Args {
 /// A channel; a frame in its place shows that it was forgotten.
 fn channel(text: &str) -> Result<Channel, String> {
     args::channel(text).map_err(|reason| {
-        if Address::is_meant_by(Path::new(text)) {
+        // can2 is an interface of this computer, too, and here a channel that there is not.
+        if grammar::channel(text).is_none() && Address::is_meant_by(Path::new(text)) {
             format!("a device is given with -d, and the channel follows, as in: cantap send -d {text} 1")
         } else if text.contains(['#', ':']) {
             format!("say on which channel before the frame, as in: cantap send 1 {text}")

@@ -135,7 +135,7 @@ fn keys_typed_at_a_terminal_reach_a_script_and_the_terminal_is_given_back() {
     terminal.wait_for("typed x");
     assert!(!terminal.is_as_a_shell_wants_it());
     terminal.keys("\x03");
-    assert_eq!(terminal.end(), 1);
+    assert_eq!(terminal.end(), 130);
     assert!(terminal.is_as_a_shell_wants_it());
 }
 

@@ -87,7 +87,9 @@ fn bits_prints_length_stuff_bits_crc_and_duration() {
     );
     let (code, out, _) = cantap("bits 001#88098A0088008101 --json");
     assert_eq!((code, json(&out)["bits"].as_u64()), (Some(0), Some(119)));
-    assert_eq!(cantap("bits 12#").0, Some(2));
+    assert_eq!(cantap("bits 12#").0, Some(0));
+    let (code, _, err) = cantap("bits 800#");
+    assert!(code == Some(2) && err.contains("00000800"), "{err}");
 }
 
 #[test]

@@ -73,9 +73,9 @@ fn with_a_condition_only_what_is_around_its_events_is_recorded() {
     for wrong in ["speed >", "Unknown > 1"] {
         assert!(page.ask("record", &json!({ "name": "a.log", "only": only(wrong) })).is_err(), "{wrong}");
     }
-    page.ask("record", &json!({ "name": "never.log", "only": only("dlc == 77 or id == 0x1FFFFFFF") }))
+    page.ask("record", &json!({ "name": "never.log", "only": only("dlc == 15 or id == 0x1FFFFFFF") }))
         .unwrap();
-    page.until(|page| page.state["recording"]["condition"] == "dlc == 77 or id == 0x1FFFFFFF");
+    page.until(|page| page.state["recording"]["condition"] == "dlc == 15 or id == 0x1FFFFFFF");
     assert_eq!(page.state["recording"]["events"], 0);
     page.ask("stopRecording", &json!({})).unwrap();
     page.until(|page| page.notices.iter().any(|text| text.contains("never came true")));

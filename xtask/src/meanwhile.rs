@@ -1,6 +1,6 @@
-//! Steps that run while other steps wait for devices, kernels and browsers.
+//! The steps that only compile, at the lowest priority, while other steps wait for devices, kernels and browsers.
 //!
-//! All use one target folder, so cargo's own lock makes one of them wait while another compiles.
+//! Both lanes use one target folder, so cargo's own lock makes one of them wait while the other compiles.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -8,25 +8,24 @@ use std::process::{Child, Command, ExitStatus, Stdio};
 
 use anyhow::{Context, Result};
 
-use crate::steps::Lane;
+use crate::steps::Step;
 use crate::{toolchain, workspace};
 
-/// A lane under way; it ends with this value.
+/// Steps under way; they end with this value.
 pub struct Meanwhile {
-    pub name: &'static str,
     child: Child,
     output: PathBuf,
     ended: bool,
 }
 
 impl Meanwhile {
-    /// Begins it, in this program once more.
-    pub fn begin(lane: &Lane) -> Result<Self> {
+    /// Begins them, one after the other, in this program once more.
+    pub fn begin(steps: &[Step]) -> Result<Self> {
         let folder = workspace::target().join("xtask");
         std::fs::create_dir_all(&folder)?;
-        let output = folder.join(format!("{}.txt", lane.name));
+        let output = folder.join("meanwhile.txt");
         let file = File::create(&output).with_context(|| output.display().to_string())?;
-        let mut command = if lane.yields && toolchain::is_installed("nice") {
+        let mut command = if toolchain::is_installed("nice") {
             let mut nice = Command::new("nice");
             nice.args(["-n", "19", "cargo"]);
             nice
@@ -34,12 +33,12 @@ impl Meanwhile {
             Command::new("cargo")
         };
         command.args(["xtask", "ci"]).current_dir(workspace::root());
-        for step in lane.steps {
+        for step in steps {
             command.args(["--only", &step.name()]);
         }
         let child =
             command.stdin(Stdio::null()).stdout(file.try_clone()?).stderr(file).spawn().context("cargo")?;
-        Ok(Self { name: lane.name, child, output, ended: false })
+        Ok(Self { child, output, ended: false })
     }
 
     /// Whether a step has failed already.

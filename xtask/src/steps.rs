@@ -32,8 +32,6 @@ pub enum Step {
     Firmware,
     /// Every test, including those that run the firmware's ELF on the emulated board.
     Tests,
-    /// The command that a newcomer runs first: both channels at full load, nothing lost.
-    Demo,
     /// Other people's crates: licences, duplicates, sources.
     Dependencies,
     /// The oldest compiler that the packages promise to build with.
@@ -60,6 +58,8 @@ pub enum Step {
     Python,
     /// The page of `cantap report` in a browser: its tests.
     Web,
+    /// The command that a newcomer runs first: both channels at full load, nothing lost.
+    Demo,
     /// The page itself, without its tests.
     Page,
     /// The crates as they would be published: each packs.
@@ -68,46 +68,26 @@ pub enum Step {
     Windows,
 }
 
-/// Steps that run one after the other, beside those of `cargo xtask ci` that are in no lane.
-pub struct Lane {
-    pub name: &'static str,
-    /// It begins when this step is over; with none, at once.
-    pub after: Option<Step>,
-    /// Whether it takes only the time that nothing else wants.
-    pub yields: bool,
-    pub steps: &'static [Step],
-}
-
 impl Step {
     /// What `cargo xtask test` runs.
     pub const TEST: [Self; 7] =
         [Self::Fmt, Self::Typos, Self::Circles, Self::Links, Self::Clippy, Self::Firmware, Self::Tests];
 
-    /// What `cargo xtask ci` runs beside the other steps.
-    pub const LANES: [Lane; 2] = [
-        // Nothing in these steps waits or looks at a clock. The first ones have target folders of their own, so that they keep nobody
-        // waiting.
-        Lane {
-            name: "meanwhile",
-            after: None,
-            yields: true,
-            steps: &[
-                Self::Page,
-                Self::Wasm,
-                Self::Systems,
-                Self::Dependencies,
-                Self::OldestCompiler,
-                Self::Fuzz,
-                Self::Features,
-                Self::Doc,
-                Self::PublicApi,
-                Self::ClippyFirmware,
-                Self::Reproducible,
-                Self::Package,
-            ],
-        },
-        // One guest processor, beside browsers and Python.
-        Lane { name: "kernel", after: Some(Self::Demo), yields: false, steps: &[Self::Kernel] },
+    /// What `cargo xtask ci` runs beside the others, at the lowest priority: these steps only compile, and nothing in them waits or looks
+    /// at a clock. The first ones have target folders of their own, so that they keep nobody waiting.
+    pub const MEANWHILE: [Self; 12] = [
+        Self::Page,
+        Self::Wasm,
+        Self::Systems,
+        Self::Dependencies,
+        Self::OldestCompiler,
+        Self::Fuzz,
+        Self::Features,
+        Self::Doc,
+        Self::PublicApi,
+        Self::ClippyFirmware,
+        Self::Reproducible,
+        Self::Package,
     ];
 
     /// What takes too long for every change, and runs weekly.

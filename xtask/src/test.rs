@@ -11,7 +11,7 @@ use crate::machine::Machine;
 use crate::meanwhile::Meanwhile;
 use crate::outcome::Outcome;
 use crate::processor_time;
-use crate::steps::{Lane, Step};
+use crate::steps::Step;
 
 /// The arguments of `cargo xtask test` and `cargo xtask ci`.
 #[derive(clap::Args)]
@@ -35,10 +35,9 @@ pub fn ci(args: &Args) -> Result<()> {
     if !args.only.is_empty() {
         return run_steps(args, &args.only, &[], &Board::ALL);
     }
-    let is_elsewhere = |step: &Step| Step::LANES.iter().any(|lane| lane.steps.contains(step));
-    let is_now = |step: &Step| !is_elsewhere(step) && !Step::WEEKLY.contains(step);
+    let is_now = |step: &Step| !Step::MEANWHILE.contains(step) && !Step::WEEKLY.contains(step);
     let steps: Vec<Step> = Step::value_variants().iter().copied().filter(is_now).collect();
-    run_steps(args, &steps, &Step::LANES, &Board::ALL)
+    run_steps(args, &steps, &Step::MEANWHILE, &Board::ALL)
 }
 
 /// A step that has run.
@@ -51,15 +50,12 @@ struct Done {
     processor: Option<Duration>,
 }
 
-/// Runs the steps one after the other, and lanes beside them; stops at the first that fails.
-fn run_steps(args: &Args, steps: &[Step], lanes: &[Lane], boards: &[Board]) -> Result<()> {
+/// Runs the steps one after the other, and others meanwhile; stops at the first that fails.
+fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> Result<()> {
     let machine = Machine::new()?;
     let mut done: Vec<Done> = Vec::new();
     let whole = Instant::now();
-    let begin_after = |over: Option<Step>| -> Result<Vec<Meanwhile>> {
-        lanes.iter().filter(|lane| lane.after == over).map(Meanwhile::begin).collect()
-    };
-    let mut under_way = begin_after(None)?;
+    let mut meanwhile = if others.is_empty() { None } else { Some(Meanwhile::begin(others)?) };
     for step in steps {
         let name = step.name();
         println!("\n--- {name}");
@@ -76,29 +72,22 @@ fn run_steps(args: &Args, steps: &[Step], lanes: &[Lane], boards: &[Board]) -> R
                 return Err(error);
             }
         }
-        under_way.extend(begin_after(Some(*step))?);
-        let mut failed = false;
-        for lane in &mut under_way {
-            failed |= lane.has_failed()?;
-        }
-        if failed {
+        if let Some(meanwhile) = &mut meanwhile
+            && meanwhile.has_failed()?
+        {
             break;
         }
     }
     println!();
-    let mut failed = Vec::new();
-    for lane in under_way {
-        println!("--- {}, beside the others", lane.name);
-        let name = lane.name;
-        if !lane.end()?.success() {
-            failed.push(name);
-        }
+    if let Some(meanwhile) = meanwhile {
+        println!("--- meanwhile");
+        let status = meanwhile.end()?;
+        println!("\n--- beside them");
+        report(&done);
+        ensure!(status.success(), "a step that ran meanwhile failed; see above");
+    } else {
+        report(&done);
     }
-    if !lanes.is_empty() {
-        println!("\n--- the others");
-    }
-    report(&done);
-    ensure!(failed.is_empty(), "a step of these lanes failed, see above: {}", failed.join(", "));
     println!("{:<16}    {:>6.1} s by the clock", "all", whole.elapsed().as_secs_f64());
     if args.timings {
         table(&machine, &done);

@@ -85,10 +85,12 @@ figure() { figures | sed "s/.*\"$1\":\[*\([0-9.]*\).*/\1/"; }
 # both NAME: the two numbers of a figure with one per channel.
 both() { figures | sed "s/.*\"$1\":\[\([0-9]*\),\([0-9]*\)\].*/\1 \2/"; }
 
-# settled: waits until nothing more comes from the device.
+# settled: waits until nothing more has come from the device for a second and a half; on a busy computer the board stands still for a while, too.
 settled() {
   _before=none
-  while _now=$(figure in_bytes) && [ "$_before" != "$_now" ]; do
+  _equal=0
+  while _now=$(figure in_bytes) && [ $_equal -lt 3 ]; do
+    if [ "$_before" = "$_now" ]; then _equal=$((_equal + 1)); else _equal=0; fi
     _before=$_now
     sleep 0.5
   done

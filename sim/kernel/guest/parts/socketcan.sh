@@ -209,8 +209,8 @@ board mark
 BUS=can0
 capture_bus
 board play 1 60 mix 1500
+until_all 1500 cat /sys/class/net/can0/statistics/rx_packets
 settled
-sleep 1
 check "socketcan: a capture without -b, at the interface's rate, ends" end_capture 0
 board dump socketcan
 delivered 1 | grep -v '^2[0-9A-F]\{7\}#' | sed 's/#R.*$/#R/' > got1

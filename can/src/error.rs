@@ -39,6 +39,24 @@ impl BusErrorKind {
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|kind| kind.name() == name)
     }
+
+    /// Its letter in the error reports of slcan, as Linux's driver reads them since version 6.0 (`drivers/net/can/slcan/slcan-core.c`). It names a
+    /// bit as it was sent: `B` is a recessive one.
+    pub const fn slcan_letter(self) -> u8 {
+        match self {
+            Self::Stuff => b's',
+            Self::Form => b'f',
+            Self::Acknowledgment => b'a',
+            Self::BitRecessive => b'B',
+            Self::BitDominant => b'b',
+            Self::Crc => b'c',
+        }
+    }
+
+    /// The error with that letter.
+    pub fn from_slcan_letter(letter: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.slcan_letter() == letter)
+    }
 }
 
 /// The state of a controller's fault confinement (ISO 11898-1).
@@ -73,6 +91,21 @@ impl ErrorState {
     pub fn from_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|state| state.name() == name)
     }
+
+    /// Its letter in the state reports of slcan, as [`BusErrorKind::slcan_letter`].
+    pub const fn slcan_letter(self) -> u8 {
+        match self {
+            Self::Active => b'a',
+            Self::Warning => b'w',
+            Self::Passive => b'p',
+            Self::BusOff => b'b',
+        }
+    }
+
+    /// The state with that letter.
+    pub fn from_slcan_letter(letter: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|state| state.slcan_letter() == letter)
+    }
 }
 
 #[cfg(test)]
@@ -83,9 +116,11 @@ mod tests {
     fn every_name_is_that_of_one() {
         for kind in BusErrorKind::ALL {
             assert_eq!(BusErrorKind::from_name(kind.name()), Some(kind));
+            assert_eq!(BusErrorKind::from_slcan_letter(kind.slcan_letter()), Some(kind));
         }
         for state in ErrorState::ALL {
             assert_eq!(ErrorState::from_name(state.name()), Some(state));
+            assert_eq!(ErrorState::from_slcan_letter(state.slcan_letter()), Some(state));
         }
         assert_eq!((BusErrorKind::from_name("bit"), ErrorState::from_name("error active")), (None, None));
     }

@@ -1,19 +1,13 @@
 //! `cantap disturb`: refused where it must be, and on the emulated board with a firmware that was built for it.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+
+use crate::in_folder::cantap;
 
 fn directory(test: &str) -> PathBuf {
     let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("disturb").join(test);
     std::fs::create_dir_all(&directory).unwrap();
     directory
-}
-
-fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
-    let output =
-        Command::new(env!("CARGO_BIN_EXE_cantap")).args(line.split(' ')).current_dir(directory).output();
-    let Output { status, stdout, stderr } = output.unwrap();
-    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
 #[test]

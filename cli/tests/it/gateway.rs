@@ -1,9 +1,10 @@
 //! `cantap delay` and `cantap gateway` as users run them.
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
 
 use serde_json::Value;
+
+use crate::in_folder::cantap;
 
 const PAGE: &str = include_str!("../../../docs/gateway.md");
 
@@ -28,13 +29,6 @@ fn directory(test: &str) -> PathBuf {
     let received: Vec<_> = both.split_inclusive('\n').filter(|line| !line.contains("can1")).collect();
     std::fs::write(directory.join("car.log"), received.concat()).unwrap();
     directory
-}
-
-fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
-    let output =
-        Command::new(env!("CARGO_BIN_EXE_cantap")).args(line.split(' ')).current_dir(directory).output();
-    let Output { status, stdout, stderr } = output.unwrap();
-    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
 fn object(directory: &Path, line: &str) -> Value {

@@ -39,6 +39,7 @@ mod firmware;
 mod follow;
 mod gateway;
 mod help;
+mod in_folder;
 mod json_schema;
 #[cfg(target_os = "linux")]
 mod list;

@@ -2,7 +2,8 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+
+use crate::in_folder::cantap;
 
 /// An ECU at 7E0:7E8 with one identifier.
 const CAR: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
@@ -39,13 +40,6 @@ fn directory(test: &str) -> PathBuf {
                 (1.004000) can0 7E8#215A5A5A314B5A41\n(1.005000) can0 7E8#2257303030303031\n";
     fs::write(directory.join("talk.log"), talk).unwrap();
     directory
-}
-
-fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
-    let Output { status, stdout, stderr } =
-        command.args(line.split(' ')).current_dir(directory).output().unwrap();
-    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
 }
 
 #[test]

@@ -297,37 +297,25 @@ impl Slcan {
                 continue;
             }
             seen.push(*letter);
-            let kind = match letter {
-                b'a' => BusErrorKind::Acknowledgment,
-                b'b' => BusErrorKind::BitDominant,
-                b'B' => BusErrorKind::BitRecessive,
-                b'c' => BusErrorKind::Crc,
-                b'f' => BusErrorKind::Form,
-                b's' => BusErrorKind::Stuff,
-                b'o' => {
+            match (letter, BusErrorKind::from_slcan_letter(*letter)) {
+                (_, Some(kind)) => self.backlog.push(Incoming::BusError { channel, kind, at }),
+                (b'o', _) => {
                     let stage = LossStage::Controller;
                     self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: true, at });
-                    continue;
                 }
-                b'O' => continue,
-                _ => {
-                    self.oddities.count("error reports of unknown kind");
-                    continue;
-                }
-            };
-            self.backlog.push(Incoming::BusError { channel, kind, at });
+                (b'O', _) => {}
+                _ => self.oddities.count("error reports of unknown kind"),
+            }
         }
     }
 
     /// `s`, a letter, and receive and transmit counter of three digits each.
     fn state(&mut self, rest: &[u8], at: At) {
         let state = match rest.first() {
-            Some(b'a') => ErrorState::Active,
-            Some(b'w') => ErrorState::Warning,
-            Some(b'p') => ErrorState::Passive,
-            Some(b'b' | b'f') => ErrorState::BusOff,
-            _ => return self.oddities.count("states that cannot be read"),
+            Some(b'f') => Some(ErrorState::BusOff),
+            letter => letter.and_then(|letter| ErrorState::from_slcan_letter(*letter)),
         };
+        let Some(state) = state else { return self.oddities.count("states that cannot be read") };
         let number = |range: std::ops::Range<usize>| {
             std::str::from_utf8(rest.get(range)?).ok()?.parse::<u16>().ok().map(|value| value.min(255) as u8)
         };

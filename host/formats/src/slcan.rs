@@ -119,27 +119,17 @@ fn report(line: &[u8]) -> Option<Line> {
             if kinds.iter().any(|other| *other != kind) {
                 return None;
             }
-            let kind = match kind {
+            match kind {
                 b'o' => return Some(lost()),
                 b'O' => return Some(Line::LeftOut(REFUSED)),
-                b'a' => BusErrorKind::Acknowledgment,
-                b'b' => BusErrorKind::BitDominant,
-                b'B' => BusErrorKind::BitRecessive,
-                b'c' => BusErrorKind::Crc,
-                b'f' => BusErrorKind::Form,
-                b's' => BusErrorKind::Stuff,
-                _ => return None,
-            };
-            TraceEvent::BusError { kind: Some(kind), counters: None }
+                _ => TraceEvent::BusError {
+                    kind: Some(BusErrorKind::from_slcan_letter(kind)?),
+                    counters: None,
+                },
+            }
         }
         [b's', state, counters @ ..] if counters.len() == 6 => {
-            let state = match state {
-                b'a' => ErrorState::Active,
-                b'w' => ErrorState::Warning,
-                b'p' => ErrorState::Passive,
-                b'b' => ErrorState::BusOff,
-                _ => return None,
-            };
+            let state = ErrorState::from_slcan_letter(*state)?;
             let [receive, transmit] = [&counters[..3], &counters[3..]].map(text::decimal);
             let counter = |count: u64| u8::try_from(count.min(255)).ok();
             TraceEvent::State { state, counters: Some((counter(transmit?)?, counter(receive?)?)) }

@@ -9,7 +9,6 @@
 use core::fmt::Write;
 
 use cantap_wire::Event;
-use cantap_wire::record::{BusErrorKind, ErrorState};
 use heapless::String;
 
 /// The longest line: `s`, state, two counters, CR.
@@ -27,22 +26,9 @@ pub fn transmit_overrun() -> Line {
 pub fn line(event: &Event) -> Option<Line> {
     match event {
         Event::Lost { .. } => Some(error('o')),
-        Event::BusError { kind, .. } => Some(error(match kind {
-            BusErrorKind::Stuff => 's',
-            BusErrorKind::Form => 'f',
-            BusErrorKind::Acknowledgment => 'a',
-            // The driver names the bit as it was sent: B is a recessive one.
-            BusErrorKind::BitRecessive => 'B',
-            BusErrorKind::BitDominant => 'b',
-            BusErrorKind::Crc => 'c',
-        })),
+        Event::BusError { kind, .. } => Some(error(kind.slcan_letter().into())),
         Event::State { state, tec, rec, .. } => {
-            let letter = match state {
-                ErrorState::Active => 'a',
-                ErrorState::Warning => 'w',
-                ErrorState::Passive => 'p',
-                ErrorState::BusOff => 'b',
-            };
+            let letter = char::from(state.slcan_letter());
             Some(written(format_args!("s{letter}{rec:03}{tec:03}\r")))
         }
         _ => None,

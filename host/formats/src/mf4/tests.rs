@@ -314,9 +314,8 @@ fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_o
     }
 }
 
-/// As CANedge loggers write them: what was sent stands behind the response to it. Each group is in order, and so is what is read.
-#[test]
-fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
+/// As [`begin`], with what was received in records with number 1, what was sent in such with number 3, and the bytes of both in those with 2.
+fn begin_scattered() -> (Blocks, u64) {
     let (mut blocks, received, bytes) = begin();
     let link = |blocks: &Blocks, at: usize| {
         u64::from_le_bytes(blocks.0[received as usize + 24 + at * 8..][..8].try_into().unwrap())
@@ -326,6 +325,13 @@ fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
     let sent = group(&mut blocks, 3, 0, RECORD_BYTES as u32, of_sent);
     blocks.0[received as usize + 24..][..8].copy_from_slice(&sent.to_le_bytes());
     blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+    (blocks, received)
+}
+
+/// As CANedge loggers write them: what was sent stands behind the response to it. Each group is in order, and so is what is read.
+#[test]
+fn records_of_several_groups_in_one_stream_come_in_the_order_of_time() {
+    let (blocks, received) = begin_scattered();
     // Every tenth is sent, and comes four frames late.
     let is_sent = |at: usize| at.is_multiple_of(10);
     let mut order: Vec<usize> = (0..100).collect();
@@ -359,15 +365,7 @@ pub(crate) struct Scattered {
 
 /// Such a file, as loggers leave it unfinished: a tenth of a frame may stand behind its successors.
 pub(crate) fn scattered(frames: &[Scattered], by_order: bool) -> Vec<u8> {
-    let (mut blocks, received, bytes) = begin();
-    let link = |blocks: &Blocks, at: usize| {
-        u64::from_le_bytes(blocks.0[received as usize + 24 + at * 8..][..8].try_into().unwrap())
-    };
-    let values = group(&mut blocks, 2, 1, 0, [0; 3]);
-    let of_sent = [values, link(&blocks, 1), link(&blocks, 3)];
-    let sent = group(&mut blocks, 3, 0, RECORD_BYTES as u32, of_sent);
-    blocks.0[received as usize + 24..][..8].copy_from_slice(&sent.to_le_bytes());
-    blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+    let (blocks, received) = begin_scattered();
     let mut at = 0;
     let times: Vec<usize> = frames
         .iter()

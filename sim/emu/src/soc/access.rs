@@ -174,12 +174,13 @@ impl Board {
     fn write_register(&mut self, address: u32, value: u32, now: u64) -> Option<()> {
         let offset = address % BLOCK;
         match address - offset {
-            0x4000_0000..=0x4000_1400 => {
+            TIM4_BASE => {
                 let done = self.timers[block(address, 0x4000_0000)].write(offset, value, now);
                 self.advance_buses(now);
                 self.follow_driven_pins(now);
                 done
             }
+            0x4000_0000..=0x4000_1400 => self.timers[block(address, 0x4000_0000)].write(offset, value, now),
             0x4000_3000 => self.watchdog.write(offset, value, now),
             CAN1_BASE | 0x4000_6800 => {
                 self.advance_buses(now);

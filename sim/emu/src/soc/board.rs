@@ -441,13 +441,18 @@ impl Board {
 
     /// Counts up to `now`; what an output does meanwhile reaches its pin at its cycle.
     fn advance_timers(&mut self, now: u64) {
+        // Otherwise only a register that is written changes a pin.
+        let mut may_drive = self.timers[TIM4].is_counting();
         for timer in &mut self.timers {
             timer.advance(now);
         }
         if let Some(at) = self.timers[TIM2].take_trigger() {
             self.timers[TIM4].internal_trigger(TIM2_TO_TIM4, at);
+            may_drive = true;
         }
-        self.follow_driven_pins(now);
+        if may_drive {
+            self.follow_driven_pins(now);
+        }
     }
 
     /// A device's trigger output pulsed at a cycle no later than `now`.

@@ -229,9 +229,15 @@ impl Timer {
         (self.input(channel) == 0 && enabled & 1 != 0).then_some(active != (enabled & 2 != 0))
     }
 
+    /// Whether it counts.
+    pub const fn is_counting(&self) -> bool {
+        self.control & CEN != 0
+    }
+
     /// When an enabled output of PWM, or the trigger output, changes next by itself.
     fn next_change(&self) -> Option<u64> {
-        if self.control & CEN == 0 {
+        const ANY_OUTPUT: u32 = 0x1111;
+        if !self.is_counting() || self.modes[2] & ANY_OUTPUT == 0 && !self.awaits_rise() {
             return None;
         }
         let is_pwm = |channel: &usize| {

@@ -91,6 +91,21 @@ mod tests {
         assert_eq!((read.len(), issues.len()), (99, 1), "{issues:?}");
     }
 
+    /// Found by random files: how many issues there were depended on how much was read at a time.
+    #[test]
+    fn a_damaged_beginning_is_one_issue_and_the_next_section_is_read() {
+        let records: Vec<_> = (0..20_000).map(data_record).collect();
+        let options = WriteOptions { format: Some(Format::Pcapng), ..WriteOptions::default() };
+        let (mut file, _) = tests::write_with(&options, &records);
+        let next = file.clone();
+        file[0] ^= 0x40;
+        let (read, issues) = tests::read(Format::Pcapng, &file);
+        assert_eq!((read.len(), issues.len()), (0, 1), "{issues:?}");
+        file.extend(next);
+        let (read, issues) = tests::read(Format::Pcapng, &file);
+        assert_eq!((read.len(), issues.len()), (20_000, 1), "{issues:?}");
+    }
+
     /// Found by random damage: the block was skipped as one of an unknown kind.
     #[test]
     fn a_packet_whose_kind_is_damaged_is_counted() {

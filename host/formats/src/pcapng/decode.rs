@@ -154,7 +154,7 @@ impl Decode for Decoder {
                 return Ok(Found::Issue(place, Fault::Truncated("a block")));
             };
             if !self.byte_order(first) {
-                input.consume(have);
+                self.to_section(input)?;
                 let fault =
                     Fault::malformed("a pcapng file, which begins with a section header", &first[..4]);
                 return Ok(Found::Issue(place, fault));
@@ -216,6 +216,22 @@ impl Decoder {
         }
         self.started = true;
         true
+    }
+
+    /// Skips to a section header, or to the end: nothing before one can be understood.
+    fn to_section(&mut self, input: &mut Input) -> io::Result<()> {
+        loop {
+            input.consume(4);
+            match input.peek(BLOCK_FRAME_BYTES)?.first_chunk().copied() {
+                Some(head) if self.byte_order(head) => return Ok(()),
+                Some(_) => {}
+                None => {
+                    let rest = input.buffered().len();
+                    input.consume(rest);
+                    return Ok(());
+                }
+            }
+        }
     }
 
     /// Whether the file's last bytes can be the beginning of a block, or a damaged length points beyond the

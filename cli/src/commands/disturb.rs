@@ -14,6 +14,7 @@ use cantap_address::OpenDevice;
 use cantap_trace::grammar;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::interrupt;
+use cantap_work::terms::counted;
 use prediction::{Expected, Prediction};
 
 use crate::one_board::OneBoard;
@@ -261,8 +262,7 @@ impl Run<'_> {
             let (seconds, us) = (time_ns / 1_000_000_000, time_ns / 1000 % 1_000_000);
             let errors = match errors {
                 0 => "no bus error".to_owned(),
-                1 => "1 bus error".to_owned(),
-                errors => format!("{errors} bus errors"),
+                errors => counted(errors as usize, "bus error"),
             };
             write!(out, "({seconds}.{us:06}) can{} {event}; {errors}", self.args.channel.index())?;
             if let Some(late_ns) = late_ns {

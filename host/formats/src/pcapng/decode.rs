@@ -154,7 +154,7 @@ impl Decode for Decoder {
                 return Ok(Found::Issue(place, Fault::Truncated("a block")));
             };
             if !self.byte_order(first) {
-                self.to_section(input)?;
+                self.skip_to_section(input)?;
                 let fault =
                     Fault::malformed("a pcapng file, which begins with a section header", &first[..4]);
                 return Ok(Found::Issue(place, fault));
@@ -219,7 +219,7 @@ impl Decoder {
     }
 
     /// Skips to a section header, or to the end: nothing before one can be understood.
-    fn to_section(&mut self, input: &mut Input) -> io::Result<()> {
+    fn skip_to_section(&mut self, input: &mut Input) -> io::Result<()> {
         loop {
             input.consume(4);
             match input.peek(BLOCK_FRAME_BYTES)?.first_chunk().copied() {

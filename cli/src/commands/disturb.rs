@@ -262,7 +262,7 @@ impl Run<'_> {
             let (seconds, us) = (time_ns / 1_000_000_000, time_ns / 1000 % 1_000_000);
             let errors = match errors {
                 0 => "no bus error".to_owned(),
-                errors => counted(errors as usize, "bus error"),
+                errors => counted(*errors as usize, "bus error"),
             };
             write!(out, "({seconds}.{us:06}) can{} {event}; {errors}", self.args.channel.index())?;
             if let Some(late_ns) = late_ns {

@@ -4,6 +4,8 @@
 
 use std::path::Path;
 
+#[path = "../../examples/ask_an_ecu.rs"]
+mod ask_an_ecu;
 #[path = "../../examples/decode_file.rs"]
 mod decode_file;
 #[path = "../../examples/print_frames.rs"]
@@ -49,11 +51,19 @@ fn a_traces_statistics_name_its_identifier_and_what_was_not_read() {
 }
 
 #[test]
+fn a_vehicle_tells_its_number_and_a_bus_without_one_does_not_answer() {
+    let vin = ask_an_ecu::vin("virtual:car").unwrap();
+    assert!(vin.len() == 17 && vin.chars().all(|letter| letter.is_ascii_alphanumeric()), "{vin}");
+    let error = ask_an_ecu::vin("virtual:bitrate=500k").unwrap_err().to_string();
+    assert!(error.contains("7E8") || error.contains("answer"), "{error}");
+}
+
+#[test]
 fn the_page_shows_the_programs() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     // In a package there is no page.
     let Ok(page) = std::fs::read_to_string(root.join("../../docs/library.md")) else { return };
-    for name in ["print_frames", "decode_file", "statistics_of_a_file"] {
+    for name in ["print_frames", "decode_file", "statistics_of_a_file", "ask_an_ecu"] {
         let program = std::fs::read_to_string(root.join(format!("examples/{name}.rs"))).unwrap();
         assert!(
             page.contains(&format!("```rust,ignore\n{program}```")),

@@ -1,6 +1,6 @@
-//! The steps that only compile, at the lowest priority, while other steps wait for devices, kernels and browsers.
+//! A lane: steps that run one after the other while the steps of another lane do.
 //!
-//! Both lanes use one target folder, so cargo's own lock makes one of them wait while the other compiles.
+//! All lanes use one target folder, so cargo's own lock makes one of them wait while another compiles.
 
 use std::fs::File;
 use std::path::PathBuf;
@@ -11,6 +11,15 @@ use anyhow::{Context, Result};
 use crate::steps::Step;
 use crate::{toolchain, workspace};
 
+/// Which processor time a lane gets.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Priority {
+    /// As much as others.
+    Normal,
+    /// What nobody else wants.
+    Lowest,
+}
+
 /// Steps under way; they end with this value.
 pub struct Meanwhile {
     child: Child,
@@ -20,12 +29,13 @@ pub struct Meanwhile {
 
 impl Meanwhile {
     /// Begins them, one after the other, in this program once more.
-    pub fn begin(steps: &[Step]) -> Result<Self> {
+    pub fn begin(steps: &[Step], priority: Priority) -> Result<Self> {
         let folder = workspace::target().join("xtask");
         std::fs::create_dir_all(&folder)?;
-        let output = folder.join("meanwhile.txt");
+        let first = steps.first().map_or_else(String::new, |step| step.name());
+        let output = folder.join(format!("beside-{first}.txt"));
         let file = File::create(&output).with_context(|| output.display().to_string())?;
-        let mut command = if toolchain::is_installed("nice") {
+        let mut command = if priority == Priority::Lowest && toolchain::is_installed("nice") {
             let mut nice = Command::new("nice");
             nice.args(["-n", "19", "cargo"]);
             nice

@@ -30,6 +30,8 @@ pub enum Step {
     Clippy,
     /// The firmware, and its memory against the budget: the default board's, or in `ci` every board's.
     Firmware,
+    /// The tests compile, and the programs that they run.
+    Build,
     /// Every test, including those that run the firmware's ELF on the emulated board.
     Tests,
     /// Other people's crates: licences, duplicates, sources.
@@ -70,8 +72,16 @@ pub enum Step {
 
 impl Step {
     /// What `cargo xtask test` runs.
-    pub const TEST: [Self; 7] =
-        [Self::Fmt, Self::Typos, Self::Circles, Self::Links, Self::Clippy, Self::Firmware, Self::Tests];
+    pub const TEST: [Self; 8] = [
+        Self::Fmt,
+        Self::Typos,
+        Self::Circles,
+        Self::Links,
+        Self::Clippy,
+        Self::Firmware,
+        Self::Build,
+        Self::Tests,
+    ];
 
     /// What `cargo xtask ci` runs beside the others, at the lowest priority: these steps only compile, and nothing in them waits or looks
     /// at a clock. The first ones have target folders of their own, so that they keep nobody waiting.
@@ -89,6 +99,10 @@ impl Step {
         Self::Reproducible,
         Self::Package,
     ];
+
+    /// What `cargo xtask ci` runs beside the tests: most of both waits, and what one of them does not use of the processors the other does.
+    /// Both have ended before the step that needs the computer for itself, [`Kernel`](Step::Kernel).
+    pub const BESIDE_TESTS: [Self; 2] = [Self::Python, Self::Web];
 
     /// What takes too long for every change, and runs weekly.
     pub const WEEKLY: [Self; 1] = [Self::Windows];
@@ -112,6 +126,11 @@ impl Step {
             }
             Step::Firmware => {
                 return with_chip(machine, |chip| firmware::build_checked(shell, chip, boards));
+            }
+            Step::Build => {
+                // They are installed first, so that whatever begins after this step finds them.
+                machine.peers()?;
+                tests::build(shell)?;
             }
             // Without a compiler for the chip those on the emulated board are ignored, and say so.
             Step::Tests => return tests::run(shell, machine.peers()?, boards),

@@ -8,7 +8,7 @@ use clap::ValueEnum;
 
 use crate::board::Board;
 use crate::machine::Machine;
-use crate::meanwhile::Meanwhile;
+use crate::meanwhile::{Meanwhile, Priority};
 use crate::outcome::Outcome;
 use crate::processor_time;
 use crate::steps::Step;
@@ -27,17 +27,26 @@ pub struct Args {
 /// What a change needs: the first steps, with the default board's firmware.
 pub fn run(args: &Args) -> Result<()> {
     let steps = if args.only.is_empty() { &Step::TEST } else { &args.only[..] };
-    run_steps(args, steps, &[], &Board::ALL[..1])
+    run_steps(args, steps, Beside::Nothing, &Board::ALL[..1])
 }
 
 /// Every step, with every board's firmware.
 pub fn ci(args: &Args) -> Result<()> {
     if !args.only.is_empty() {
-        return run_steps(args, &args.only, &[], &Board::ALL);
+        return run_steps(args, &args.only, Beside::Nothing, &Board::ALL);
     }
-    let is_now = |step: &Step| !Step::MEANWHILE.contains(step) && !Step::WEEKLY.contains(step);
+    let others = [&Step::MEANWHILE[..], &Step::BESIDE_TESTS, &Step::WEEKLY].concat();
+    let is_now = |step: &Step| !others.contains(step);
     let steps: Vec<Step> = Step::value_variants().iter().copied().filter(is_now).collect();
-    run_steps(args, &steps, &Step::MEANWHILE, &Board::ALL)
+    run_steps(args, &steps, Beside::Everything, &Board::ALL)
+}
+
+/// What runs beside the steps of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Beside {
+    Nothing,
+    /// [`Step::MEANWHILE`] from the beginning, [`Step::BESIDE_TESTS`] from the tests on.
+    Everything,
 }
 
 /// A step that has run.
@@ -50,21 +59,29 @@ struct Done {
     processor: Option<Duration>,
 }
 
-/// Runs the steps one after the other, and others meanwhile; stops at the first that fails.
-fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> Result<()> {
+/// Runs the steps one after the other, and others beside them; stops at the first that fails.
+fn run_steps(args: &Args, steps: &[Step], beside: Beside, boards: &[Board]) -> Result<()> {
     let machine = Machine::new()?;
     let mut done: Vec<Done> = Vec::new();
     let whole = Instant::now();
-    let mut meanwhile = if others.is_empty() { None } else { Some(Meanwhile::begin(others)?) };
-    for step in steps {
+    let is_all = beside == Beside::Everything;
+    let begin = |steps: &[Step], priority| is_all.then(|| Meanwhile::begin(steps, priority)).transpose();
+    let mut meanwhile = begin(&Step::MEANWHILE, Priority::Lowest)?;
+    let mut beside_tests = None;
+    'steps: for step in steps {
+        match step {
+            Step::Tests => beside_tests = begin(&Step::BESIDE_TESTS, Priority::Normal)?,
+            Step::Kernel => end(beside_tests.take())?,
+            _ => {}
+        }
         let name = step.name();
         println!("\n--- {name}");
-        let (begin, processor) = (Instant::now(), processor_time::of_children());
+        let (since, processor) = (Instant::now(), processor_time::of_children());
         match step.run(&machine, boards) {
             Ok(outcome) => {
                 let processor =
                     processor_time::of_children().zip(processor).map(|(now, then)| now.saturating_sub(then));
-                done.push(Done { name, outcome, time: begin.elapsed(), processor });
+                done.push(Done { name, outcome, time: since.elapsed(), processor });
             }
             Err(error) => {
                 report(&done);
@@ -72,26 +89,29 @@ fn run_steps(args: &Args, steps: &[Step], others: &[Step], boards: &[Board]) -> 
                 return Err(error);
             }
         }
-        if let Some(meanwhile) = &mut meanwhile
-            && meanwhile.has_failed()?
-        {
-            break;
+        for lane in [&mut meanwhile, &mut beside_tests].into_iter().flatten() {
+            if lane.has_failed()? {
+                break 'steps;
+            }
         }
     }
     println!();
-    if let Some(meanwhile) = meanwhile {
-        println!("--- meanwhile");
-        let status = meanwhile.end()?;
-        println!("\n--- beside them");
-        report(&done);
-        ensure!(status.success(), "a step that ran meanwhile failed; see above");
-    } else {
-        report(&done);
-    }
+    end(beside_tests)?;
+    end(meanwhile)?;
+    println!("--- beside them");
+    report(&done);
     println!("{:<16}    {:>6.1} s by the clock", "all", whole.elapsed().as_secs_f64());
     if args.timings {
         table(&machine, &done);
     }
+    Ok(())
+}
+
+/// Waits for a lane's end.
+fn end(lane: Option<Meanwhile>) -> Result<()> {
+    let Some(lane) = lane else { return Ok(()) };
+    println!("--- meanwhile");
+    ensure!(lane.end()?.success(), "a step that ran meanwhile failed; see above");
     Ok(())
 }
 

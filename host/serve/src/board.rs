@@ -20,7 +20,9 @@ use crate::lock::lock;
 use crate::log_limit::LogLimit;
 use crate::modes;
 use crate::news::News;
-use crate::permissions::{Denied, Permissions, Permit};
+use crate::permissions::Permissions;
+#[cfg(feature = "tls")]
+use crate::permissions::{Denied, Permit};
 use crate::shared::{Refused, Settings, Shared};
 use crate::state::Then;
 use crate::upstream::{Upstream, end_sessions};
@@ -155,6 +157,7 @@ impl Board {
     }
 
     /// What the client with a certificate of this name may do, unless nothing is restricted.
+    #[cfg(feature = "tls")]
     pub(crate) fn permit_of(&self, certificate: &str) -> Result<Option<Permit>, Denied> {
         self.shared.permit_of(certificate).map(|found| found.map(|(permit, _)| permit))
     }

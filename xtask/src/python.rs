@@ -80,16 +80,14 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap python/tests/typed.py")
         .run()?;
     cmd!(shell, "{python} -m mypy.stubtest --mypy-config-file python/pyproject.toml cantap._native").run()?;
-    let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");
     // Built by the tests' step; without it, the tests that need a server say that they were skipped.
     let command = workspace::target().join("debug/cantap");
     let named = command.exists().then_some(("CANTAP_COMMAND", command));
     let fleet = ["--ignore", "python/tests/test_fleet.py"];
-    // Most of them wait. python-can's look at the clock, so they run alone.
-    let alone = "python/tests/test_python_can_suite.py";
+    // Most of them wait.
     let workers = tests::threads().to_string();
-    let side_by_side = ["--numprocesses", &workers, "--dist", "worksteal", "--ignore", alone];
+    let side_by_side = ["--numprocesses", &workers, "--dist", "worksteal", "--ignore", PYTHON_CAN_SUITE];
     // Not from `python/`, where `import cantap` would find the sources.
     let mut outcome = Outcome::Passed;
     let together = cmd!(shell, "{pytest} -m pytest --quiet python/tests {fleet...} {side_by_side...}");
@@ -97,17 +95,32 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
         // Beside others and alone: see `tests::run`.
         println!("\nonce more, alone: the ones that failed");
         let failed = ["--last-failed", "--last-failed-no-failures", "none", "-rA"];
-        cmd!(shell, "{pytest} -m pytest python/tests {fleet...} --ignore {alone} {failed...}")
-            .envs(named.clone())
+        cmd!(shell, "{pytest} -m pytest python/tests {fleet...} --ignore {PYTHON_CAN_SUITE} {failed...}")
+            .envs(named)
             .run()?;
         outcome = Outcome::Flaky(vec!["what pytest listed under 'once more'".to_owned()]);
     }
-    cmd!(shell, "{pytest} -m pytest --quiet {alone}")
-        .env("CANTAP_PYTHON_CAN_SOURCE", suite)
-        .envs(named)
-        .run()?;
     fleet::check(shell, &wheel)?;
     Ok(outcome)
+}
+
+/// Where python-can's own tests are run from.
+const PYTHON_CAN_SUITE: &str = "python/tests/test_python_can_suite.py";
+
+/// python-can's own tests, with the package that [`check`] has installed. They look at the clock, so nothing runs beside them.
+pub fn check_python_can(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
+    if peers.is_none() {
+        return Ok(Outcome::Skipped("it needs the peers, which cannot be installed here".to_owned()));
+    }
+    let mut python = target().join("venv/bin/python");
+    if !python.exists() {
+        python = environment(shell, &wheel(shell)?)?;
+    }
+    let suite = python_can(shell, &python)?;
+    cmd!(shell, "{python} -m pytest --quiet {PYTHON_CAN_SUITE}")
+        .env("CANTAP_PYTHON_CAN_SOURCE", suite)
+        .run()?;
+    Ok(Outcome::Passed)
 }
 
 /// Times it against other people's packages.

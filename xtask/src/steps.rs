@@ -56,8 +56,10 @@ pub enum Step {
     Reproducible,
     /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
     Kernel,
-    /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
+    /// The package for Python: wheel, types, tests, notebooks.
     Python,
+    /// python-can's own tests, with that package.
+    PythonCan,
     /// The page of `cantap report` in a browser: its tests.
     Web,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
@@ -160,6 +162,7 @@ impl Step {
                 };
             }
             Step::Python => return python::check(shell, machine.peers()?),
+            Step::PythonCan => return python::check_python_can(shell, machine.peers()?),
             Step::Web => return web::check(machine),
             Step::Page => return web::builds(machine),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,

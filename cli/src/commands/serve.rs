@@ -271,8 +271,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 #[cfg(unix)]
 fn take_all_descriptors() {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-    let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
-    let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    // Under systemd, where the unit says how many, this is not permitted and would end the server.
+    if current != maximum {
+        let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
+    }
 }
 
 /// Opens a device, which must be there unless it is waited for.

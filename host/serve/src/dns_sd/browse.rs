@@ -71,7 +71,9 @@ pub(super) fn browse_on(network: Network, time: Duration) -> io::Result<Browsed>
         if Instant::now() >= ask_at {
             ask_at += ASK_EVERY;
             let question = Message { id, ..heard.question() };
-            speakers.iter().for_each(|speaker| speaker.tell_all(&question));
+            for speaker in &speakers {
+                speaker.tell_all(&question);
+            }
         }
         let mut is_quiet = true;
         for speaker in &speakers {

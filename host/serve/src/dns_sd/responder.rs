@@ -347,7 +347,9 @@ impl Responder {
         }
         if let Phase::Probing(_) = self.phase {
             self.host.number += u32::from(host);
-            services.iter().for_each(|number| self.services[*number].0.number += 1);
+            for number in services {
+                self.services[number].0.number += 1;
+            }
         }
         self.conflicts.push_back(now);
         while self.conflicts.len() > MOST_CONFLICTS {

@@ -60,10 +60,10 @@ fn names_are_tried_three_times_and_then_announced_twice() {
     let said = link.pass(Duration::from_secs(10));
     let (probes, announced) = said.split_at(6);
     assert!(probes.iter().all(|(_, message)| !message.is_answer && message.proposed.len() == 3));
-    assert_eq!(probes[4].0 - probes[0].0, 2 * BETWEEN_PROBES);
+    assert_eq!(probes[4].0.abs_diff(probes[0].0), 2 * BETWEEN_PROBES);
     assert_eq!(announced.len(), 4);
     assert!(announced.iter().all(|(_, message)| message.is_answer));
-    assert_eq!(announced[2].0 - announced[0].0, BETWEEN_ANNOUNCEMENTS);
+    assert_eq!(announced[2].0.abs_diff(announced[0].0), BETWEEN_ANNOUNCEMENTS);
     // The host's address is said once each time.
     let addresses =
         announced.iter().flat_map(|(_, message)| &message.answers).filter(|record| record.kind == kind::A);
@@ -86,7 +86,9 @@ fn a_flood_of_questions_is_answered_once_a_second() {
         Message::question(link.responder.name(1), kind::ANY),
     ];
     for _ in 0..10_000 {
-        questions.iter().for_each(|question| link.take(question));
+        for question in &questions {
+            link.take(question);
+        }
         said += link.pass(Duration::from_millis(1)).len();
     }
     assert!((24..=33).contains(&said), "{said} packets in 10 s, of three");

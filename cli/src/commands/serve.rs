@@ -231,6 +231,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut upkeep = Upkeep::new(permissions, args.audit.as_deref(), way.scheme() == "tls")?;
     // From here on, Ctrl-C ends it properly.
     interrupt::watch()?;
+    #[cfg(unix)]
+    take_all_descriptors();
     let mut boards = Vec::new();
     for (number, address) in addresses.iter().enumerate() {
         let board = start(args, number, address)?;
@@ -262,6 +264,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     upkeep.finish();
     Ok(ExitCode::SUCCESS)
+}
+
+/// Takes all file descriptors that the system grants. Each listener bounds its connections, but together those of many boards are more than the
+/// usual 1024, and strangers must not use up those by which the owner comes in. Without the right to more, it stays as it is.
+#[cfg(unix)]
+fn take_all_descriptors() {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    let Rlimit { current, maximum } = getrlimit(Resource::Nofile);
+    // Under systemd, where the unit says how many, this is not permitted and would end the server.
+    if current != maximum {
+        let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
+    }
 }
 
 /// Opens a device, which must be there unless it is waited for.

@@ -8,7 +8,9 @@ use std::process::{Command, Stdio};
 
 use rustix::process::Signal;
 
-use crate::served::server::{Server, cantap, capture, log, nothing_lost, run, said, signal, wait_for};
+use crate::served::server::{
+    CANTAP, Server, cantap, capture, log, nothing_lost, run, said, signal, wait_for,
+};
 
 /// A folder with keys for three clients, and a server that restricts two of them.
 struct Lab {
@@ -185,6 +187,96 @@ fn a_hang_up_reads_the_files_again_and_those_whom_it_concerns_go() {
     assert_eq!(code, Some(0), "{err}");
     let trace = lab.path("again.log");
     nothing_lost(&capture(&lab.of("bob"), &trace, "-t 500ms").output().unwrap());
+}
+
+/// A program that knows only socketcand.
+struct Foreign {
+    stream: TcpStream,
+    heard: String,
+}
+
+impl Foreign {
+    /// At a tunnel's listener, with a bus open in raw mode.
+    fn at(tunnel: &Server) -> Self {
+        let place = tunnel.at[1].strip_prefix("can://").unwrap();
+        let mut foreign = Self { stream: TcpStream::connect(place).unwrap(), heard: String::new() };
+        foreign.hear("< hi >");
+        foreign
+    }
+
+    fn raw(mut self) -> Self {
+        self.ask("open can0", "< ok >");
+        self.ask("rawmode", "< ok >");
+        self
+    }
+
+    fn ask(&mut self, command: &str, answer: &str) {
+        self.stream.write_all(format!("< {command} >").as_bytes()).unwrap();
+        self.hear(answer);
+    }
+
+    /// Reads up to this.
+    fn hear(&mut self, wanted: &str) {
+        let mut bytes = [0; 4096];
+        loop {
+            if let Some(at) = self.heard.find(wanted) {
+                self.heard.drain(..at + wanted.len());
+                return;
+            }
+            let len = self.stream.read(&mut bytes).unwrap();
+            assert!(len > 0, "it ended without '{wanted}': {}", self.heard);
+            self.heard.push_str(std::str::from_utf8(&bytes[..len]).unwrap());
+        }
+    }
+}
+
+/// Programs on another computer that know only socketcand come through TLS by a server of their own, as docs/serve.md says: they may do what its
+/// certificate may.
+#[test]
+fn a_tunnel_for_socketcand_has_the_permissions_of_its_certificate() {
+    let mut lab = Lab::open();
+    let tunnel = |name: &str| {
+        let socket = lab.path(name).display().to_string();
+        let arguments = "--socketcand 0 --allow socketcand:send";
+        Server::start(&format!("-d {} --unix {socket} {arguments}", lab.of(name)), 2)
+    };
+    // How socketcand says that a frame was not sent, to clients that read nothing but frames.
+    let not_sent = "< error 20000001 ";
+    let (alices, bobs) = (tunnel("alice"), tunnel("bob"));
+    let mut alice = Foreign::at(&alices).raw();
+    alice.hear("< frame ");
+    alice.ask("send 124 1 11", not_sent);
+    lab.remark("sending 124 is not permitted");
+    Foreign::at(&alices).ask("open can1", "< error could not open bus >");
+    lab.remark("channel 2 is not permitted");
+    // Whoever may only listen does so there, whatever the tunnel allows.
+    let mut bob = Foreign::at(&bobs).raw();
+    bob.hear("< frame ");
+    alice.stream.write_all(b"< send 123 2 C0 FE >").unwrap();
+    bob.hear(" C0FE >");
+    bob.ask("send 123 1 11", not_sent);
+    drop((alice, bob, alices, bobs));
+    assert!(lab.server.interrupt().success());
+    let sent: Vec<_> = lab.events().into_iter().filter(|event| event["event"] == "sent").collect();
+    assert!(sent.len() == 1 && sent[0]["certificate"] == "alice" && sent[0]["frames"] == 1, "{sent:?}");
+}
+
+/// Strangers' connections are bounded at each listener, and all listeners together may still have more than the usual descriptors.
+#[test]
+fn strangers_do_not_use_up_the_descriptors_by_which_the_owner_comes_in() {
+    let folder = tempfile::tempdir().unwrap();
+    let socket = folder.path().join("cantap.sock").display().to_string();
+    let mut few = Command::new("/bin/sh");
+    let serve = format!("serve -d virtual -b 500k --unix {socket} --socketcand 0");
+    few.args(["-c", &format!("ulimit -Sn 64 && exec {CANTAP} {serve}")]).stdout(Stdio::piped());
+    let server = Server::of(&mut few, 2);
+    let place = server.at[1].strip_prefix("can://").unwrap();
+    let strangers: Vec<_> = (0..32).map(|_| TcpStream::connect(place).unwrap()).collect();
+    for mut stranger in &strangers {
+        stranger.read_exact(&mut [0; "< hi >".len()]).unwrap();
+    }
+    let (code, _, err) = run(&format!("info -d {}", server.at[0]));
+    assert_eq!(code, Some(0), "{err}");
 }
 
 /// A board that comes later, as a serial port does.

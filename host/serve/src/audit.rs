@@ -58,6 +58,8 @@ impl Audit {
     /// Appends to a file, which only this user can read if it is made here. `trouble` is called with what goes wrong later, once for each
     /// change.
     pub fn open(path: &Path, trouble: impl Fn(String) + Send + 'static) -> io::Result<Self> {
+        // A link that is there now is the one that was meant. One that takes the file's place later is not followed.
+        let path = if path.is_symlink() { &path.canonicalize()? } else { path };
         let log =
             Log { file: Some(open(path)?), path: path.to_owned(), missing: 0, trouble: Box::new(trouble) };
         let (lines, waiting) = sync_channel(MOST_WAITING);
@@ -198,14 +200,15 @@ fn open(path: &Path) -> io::Result<File> {
     options.create(true).append(true);
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
-    small_file::open(path, &mut options)
+    // Whoever may write in the folder must not have lines appended to another file of this user's.
+    small_file::open_itself(path, &mut options)
 }
 
 /// Whether a file is still the one at its path.
 #[cfg(unix)]
 fn is_at(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
-    let (Ok(own), Ok(there)) = (file.metadata(), path.metadata()) else { return false };
+    let (Ok(own), Ok(there)) = (file.metadata(), path.symlink_metadata()) else { return false };
     (own.dev(), own.ino()) == (there.dev(), there.ino())
 }
 
@@ -260,6 +263,32 @@ mod tests {
         std::fs::rename(&path, &old).unwrap();
         log.take(Some(&line("b")));
         assert_eq!((events(&old), events(&path)), (vec!["a".to_owned()], vec!["b".to_owned()]));
+    }
+
+    /// Another user who may write in the folder puts a link there, to a file of this user's.
+    #[cfg(unix)]
+    #[test]
+    fn a_link_that_takes_the_file_s_place_is_not_followed() {
+        let folder = tempfile::tempdir().unwrap();
+        let [path, old, other] = ["audit", "audit.1", "other"].map(|name| folder.path().join(name));
+        let (trouble, told) = channel();
+        let audit = Audit::open(&path, move |text| drop(trouble.send(text))).unwrap();
+        std::fs::write(&other, "").unwrap();
+        std::fs::rename(&path, &old).unwrap();
+        std::os::unix::fs::symlink(&other, &path).unwrap();
+        audit.note(json!({ "event": "a" }));
+        assert!(told.recv().unwrap().contains("a link has taken its place"));
+        std::fs::remove_file(&path).unwrap();
+        audit.note(json!({ "event": "b" }));
+        drop(audit);
+        assert_eq!((events(&path), events(&other).len()), (vec!["missing".to_owned(), "b".to_owned()], 0));
+        // One that was there at the start is the one that was meant.
+        std::fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink(&other, &path).unwrap();
+        let audit = Audit::open(&path, |text| panic!("{text}")).unwrap();
+        audit.note(json!({ "event": "c" }));
+        drop(audit);
+        assert_eq!(events(&other), ["c"]);
     }
 
     /// No disk is full on request, but a folder that is missing has no room either.

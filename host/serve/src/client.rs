@@ -5,6 +5,7 @@ pub mod budget;
 mod channels;
 mod sending;
 
+use std::cell::Cell;
 use std::io::Read;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -75,7 +76,7 @@ impl Client {
         let mut inbox = Inbox::default();
         let mut first = Vec::new();
         let mut silence = Silence::default();
-        let mut checked_at = came;
+        let checked_at = Cell::new(came);
         let mut bytes = [0; 4096];
         while !self.outbox.is_closed() {
             let len = match input.read(&mut bytes) {
@@ -99,7 +100,10 @@ impl Client {
                 first.extend(bytes.iter().skip(zeros).take(foreign::ENOUGH));
             }
             let mut goes_on = !is_stranger(&first, &inbox);
-            inbox.push(bytes, |incoming| goes_on = goes_on && self.take(incoming));
+            // What waits in one piece can take long: for as long as it does not read its answers.
+            inbox.push(bytes, |incoming| {
+                goes_on = goes_on && self.may_stay(&checked_at) && self.take(incoming)
+            });
             if !self.has_greeted() && !first.is_empty() && (!goes_on || is_stranger(&first, &inbox)) {
                 self.let_go(foreign::reason(&first));
                 return;
@@ -107,13 +111,8 @@ impl Client {
             if !goes_on || !self.has_greeted() && came.elapsed() > GREETING_TIMEOUT {
                 return;
             }
-            if checked_at.elapsed() >= CHECK_EVERY {
-                checked_at = Instant::now();
-                self.record_sent();
-                if let Err(reason) = self.check() {
-                    self.let_go(reason);
-                    return;
-                }
+            if !self.may_stay(&checked_at) {
+                return;
             }
             let silent = silence.pass(len > 0);
             if silent >= SENDER_TIMEOUT && self.with(|_, member| member.views.iter().any(View::transmits)) {
@@ -127,6 +126,16 @@ impl Client {
                 self.stop_entries(after);
             }
         }
+    }
+
+    /// Checks now and then whether it may stay, and records how much it sent.
+    fn may_stay(&self, checked_at: &Cell<Instant>) -> bool {
+        if checked_at.get().elapsed() < CHECK_EVERY {
+            return true;
+        }
+        checked_at.set(Instant::now());
+        self.record_sent();
+        self.check().map_err(|reason| self.let_go(reason)).is_ok()
     }
 
     /// Takes what it said. Returns whether it may go on.
@@ -466,3 +475,6 @@ impl Silence {
         self.since
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -24,7 +24,7 @@ use crate::listen::{Listening, accept, bind, patience};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
 use crate::own_frames::OwnFrames;
-use crate::places::{GREETING_TIMEOUT, Place, Places, ends};
+use crate::places::{GREETING_TIMEOUT, Origin, Place, Places, ends};
 use crate::text::now_ns;
 use crate::writer::took_nothing;
 use crate::{Board, News};
@@ -46,7 +46,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
     Listening::start("cantap-gvret", Some(address), move || {
         let (stream, peer) = accept(&listener, role)?;
         let name = format!("GVRET client {peer}");
-        let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
+        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
             Ok(place) => place,
             Err(full) => {
                 boards[0].tell(News::Refused { client: name, reason: full.to_string() });

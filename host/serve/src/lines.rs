@@ -14,7 +14,7 @@ use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::{LOST, LeftOut};
 use crate::listen::{Listening, accept, bind_loopback, turn_away};
-use crate::places::{Places, ends};
+use crate::places::{Origin, Places, ends};
 use crate::writer::PATIENCE;
 use crate::{Board, News};
 
@@ -30,7 +30,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
     Listening::start("cantap-lines", Some(address), move || {
         let (mut stream, peer) = accept(&listener, Role::Listen)?;
         let name = format!("line reader {peer}");
-        let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
+        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
             Ok(place) => place,
             Err(full) => {
                 turn_away(&boards[0], &mut stream, name, &full);

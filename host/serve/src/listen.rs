@@ -20,7 +20,7 @@ use crate::connect::prepare;
 use crate::inherited;
 #[cfg(unix)]
 use crate::peer;
-use crate::places::{NoPlace, Place, Places, ends, refuse};
+use crate::places::{NoPlace, Origin, Place, Places, ends, refuse};
 #[cfg(unix)]
 use crate::socket_file::{self, SocketError, SocketFile};
 use crate::{Board, News, writer};
@@ -107,7 +107,7 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
         stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
         keep_little(&stream)?;
         let ended = stream.try_clone()?;
-        let place = places.enter(None, move || drop(ended.shutdown(std::net::Shutdown::Both)));
+        let place = places.enter(Origin::HERE, move || drop(ended.shutdown(std::net::Shutdown::Both)));
         let output = stream.try_clone()?;
         let_in(&board, place, stream, output, Arrival { name, role, is_remote: false, identity: None });
         Ok(())
@@ -125,7 +125,7 @@ pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Li
     Listening::start("cantap-tcp", Some(address), move || {
         let (stream, peer) = accept(&listener, role)?;
         let name = format!("client {peer}");
-        let place = places.enter(Some(peer.ip()), ends(&stream)?);
+        let place = places.enter(Origin::of(&stream, peer), ends(&stream)?);
         let output = stream.try_clone()?;
         // A tunnel may end here.
         let_in(&board, place, stream, output, Arrival { name, role, is_remote: true, identity: None });

@@ -16,7 +16,7 @@ use cantap_wire::message::Role;
 use crate::Board;
 use crate::board_figures::BoardFigures;
 use crate::listen::{Listening, accept, bind};
-use crate::places::{Places, ends};
+use crate::places::{Origin, Places, ends};
 use crate::totals::ChannelTotals;
 
 /// Longest request.
@@ -36,7 +36,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
     let places = Places::new(MOST_CONNECTIONS);
     Listening::start("cantap-metrics", Some(address), move || {
         let (stream, peer) = accept(&listener, Role::Listen)?;
-        let Ok(place) = places.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };
+        let Ok(place) = places.enter(Origin::of(&stream, peer), ends(&stream)?) else { return Ok(()) };
         let boards = boards.clone();
         std::thread::Builder::new().name("cantap-metrics-client".to_owned()).spawn(move || {
             // Whoever has left needs no answer.

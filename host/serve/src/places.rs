@@ -2,7 +2,7 @@
 //! who has not said what it wants, so that strangers who only connect keep nobody out.
 
 use std::io::Write;
-use std::net::{IpAddr, Shutdown, TcpStream};
+use std::net::{IpAddr, Ipv6Addr, Shutdown, SocketAddr, TcpStream};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -11,6 +11,8 @@ pub struct Places {
     most: usize,
     /// For one address of another computer.
     most_from_one: usize,
+    /// For all other computers together: those that are left are for programs of this one.
+    most_from_others: usize,
     table: Mutex<Table>,
 }
 
@@ -23,10 +25,34 @@ struct Table {
 
 struct Seat {
     number: u64,
-    from: Option<IpAddr>,
+    from: Origin,
     standing: Standing,
     /// Ends the connection.
     end: Box<dyn Fn() + Send>,
+}
+
+/// Where a peer comes from, as far as places go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Origin(Option<IpAddr>);
+
+impl Origin {
+    /// From this computer.
+    pub const HERE: Self = Self(None);
+
+    /// That of a connection.
+    pub fn of(stream: &TcpStream, peer: SocketAddr) -> Self {
+        let is_own = stream.local_addr().is_ok_and(|own| own.ip() == peer.ip());
+        if is_own { Self::HERE } else { Self::at(peer.ip()) }
+    }
+
+    /// That of an address. Whoever has one of IPv6 has the 2^64 others of its network as well.
+    pub fn at(ip: IpAddr) -> Self {
+        Self(match ip.to_canonical() {
+            ip if ip.is_loopback() => None,
+            IpAddr::V6(ip) => Some(IpAddr::V6(Ipv6Addr::from_bits(ip.to_bits() & u128::MAX << 64))),
+            ip => Some(ip),
+        })
+    }
 }
 
 /// What a peer has shown of itself.
@@ -49,6 +75,9 @@ pub enum NoPlace {
     /// All from this address are being served.
     #[error("there are {0} clients from this address already")]
     FromOne(usize),
+    /// All for other computers are being served.
+    #[error("there are {0} clients from other computers already")]
+    FromOthers(usize),
 }
 
 /// A place; it becomes free when this is dropped.
@@ -58,38 +87,39 @@ pub struct Place {
 }
 
 impl Places {
-    /// So many, half of them for one address. Whoever is on this computer has all of them: there, an address says nothing.
+    /// So many, half of them for one address of another computer, and an eighth for this computer alone.
     pub fn new(most: usize) -> Arc<Self> {
-        Arc::new(Self { most, most_from_one: most.div_ceil(2), table: Mutex::default() })
+        let most_from_others = most - most / 8;
+        Arc::new(Self { most, most_from_one: most.div_ceil(2), most_from_others, table: Mutex::default() })
     }
 
     /// Takes a place. If there is none, the peer that has said least, and of those the one that has been there longest, is let go
     /// with its `end`; peers that are being served stay.
-    pub fn enter(
-        self: &Arc<Self>,
-        from: Option<IpAddr>,
-        end: impl Fn() + Send + 'static,
-    ) -> Result<Place, NoPlace> {
+    pub fn enter(self: &Arc<Self>, from: Origin, end: impl Fn() + Send + 'static) -> Result<Place, NoPlace> {
         let mut table = self.lock();
-        let same = from.filter(|from| !from.is_loopback());
-        let is_crowded = same.is_some()
-            && table.seats.iter().filter(|seat| seat.from == same).count() >= self.most_from_one;
-        if is_crowded || table.seats.len() >= self.most {
-            let may_go =
-                |seat: &&Seat| seat.standing < Standing::Served && (!is_crowded || seat.from == same);
+        // Of the seats that count against each limit, one is free, or has to be freed.
+        let of_one = |seat: &Seat| seat.from == from;
+        let of_others = |seat: &Seat| seat.from != Origin::HERE;
+        let of_all = |_: &Seat| true;
+        let limits: [(usize, &dyn Fn(&Seat) -> bool, NoPlace); 3] = [
+            (self.most_from_one, &of_one, NoPlace::FromOne(self.most_from_one)),
+            (self.most_from_others, &of_others, NoPlace::FromOthers(self.most_from_others)),
+            (self.most, &of_all, NoPlace::Full(self.most)),
+        ];
+        // On this computer, addresses say nothing.
+        let limits = limits.iter().skip(if from == Origin::HERE { 2 } else { 0 });
+        for (most, counts, full) in limits {
+            if table.seats.iter().filter(|seat| counts(seat)).count() < *most {
+                continue;
+            }
+            let may_go = |seat: &&Seat| seat.standing < Standing::Served && counts(seat);
             let least = table.seats.iter().filter(may_go).min_by_key(|seat| (seat.standing, seat.number));
-            let Some(number) = least.map(|seat| seat.number) else {
-                return Err(if is_crowded {
-                    NoPlace::FromOne(self.most_from_one)
-                } else {
-                    NoPlace::Full(self.most)
-                });
-            };
+            let Some(number) = least.map(|seat| seat.number) else { return Err(*full) };
             table.leave(number).into_iter().for_each(|seat| (seat.end)());
         }
         let number = table.next;
         table.next += 1;
-        table.seats.push(Seat { number, from: same, standing: Standing::Silent, end: Box::new(end) });
+        table.seats.push(Seat { number, from, standing: Standing::Silent, end: Box::new(end) });
         drop(table);
         Ok(Place { places: Arc::clone(self), number })
     }
@@ -165,7 +195,7 @@ mod tests {
         let gone = Arc::new(Mutex::new(Vec::new()));
         let enter = |name: &'static str| {
             let gone = Arc::clone(&gone);
-            places.enter(None, move || gone.lock().unwrap().push(name))
+            places.enter(Origin::HERE, move || gone.lock().unwrap().push(name))
         };
         let [served, speaks, _silent] = ["served", "speaks", "silent"].map(|name| enter(name).unwrap());
         served.is_served();
@@ -184,26 +214,60 @@ mod tests {
         assert!(enter("fourth").is_ok());
     }
 
-    #[test]
-    fn one_address_has_half_of_the_places_and_lets_go_of_its_own() {
-        let places = Places::new(4);
+    /// A limit that is reached, with silent peers: how many of them had to go.
+    fn crowd(places: &Arc<Places>, from: impl Fn(u16) -> IpAddr, count: u16) -> (Vec<Place>, usize) {
         let gone = Arc::new(AtomicUsize::new(0));
-        let enter = |from| {
+        let enter = |number| {
             let gone = Arc::clone(&gone);
-            places.enter(from, move || {
+            places.enter(Origin::at(from(number)), move || {
                 gone.fetch_add(1, Ordering::Relaxed);
             })
         };
-        let own = enter(Some(address(1))).unwrap();
-        let _crowd: Vec<_> = (0..20).map(|_| enter(Some(address(2))).unwrap()).collect();
-        assert_eq!(gone.load(Ordering::Relaxed), 18);
-        own.is_served();
-        let last: Vec<_> = (0..2).map(|_| enter(Some(address(2))).unwrap()).collect();
+        let crowd = (0..count).map(|number| enter(number).unwrap()).collect();
+        (crowd, gone.load(Ordering::Relaxed))
+    }
+
+    #[test]
+    fn one_address_has_half_of_the_places_and_lets_go_of_its_own() {
+        let places = Places::new(4);
+        let (own, _) = crowd(&places, |_| address(1), 1);
+        let (_crowd, gone) = crowd(&places, |_| address(2), 20);
+        assert_eq!(gone, 18);
+        own[0].is_served();
+        let (last, _) = crowd(&places, |_| address(2), 2);
         last.iter().for_each(Place::is_served);
-        assert_eq!(enter(Some(address(2))).err(), Some(NoPlace::FromOne(2)));
-        assert!(enter(Some(address(3))).is_ok());
+        let enter = |ip| places.enter(Origin::at(ip), || ());
+        assert_eq!(enter(address(2)).err(), Some(NoPlace::FromOne(2)));
+        assert!(enter(address(3)).is_ok());
         // On this computer, addresses say nothing.
-        let local: Vec<_> = (0..9).map(|_| enter(Some(IpAddr::from([127, 0, 0, 1])))).collect();
+        let local: Vec<_> = (0..9).map(|_| enter(IpAddr::from([127, 0, 0, 1]))).collect();
         assert!(local.iter().all(Result::is_ok));
+    }
+
+    #[test]
+    fn a_network_of_ipv6_is_one_address_and_a_mapped_one_is_that_of_ipv4() {
+        let in_network =
+            |network: u16, host: u16| IpAddr::from([0x2001, 0xDB8, 0, network, host, 0, 0, host]);
+        let places = Places::new(8);
+        let (all, gone) = crowd(&places, |host| in_network(1, host), 100);
+        assert_eq!(gone, 96);
+        all.iter().for_each(Place::is_served);
+        let enter = |ip| places.enter(Origin::at(ip), || ());
+        assert_eq!(enter(in_network(1, 1000)).err(), Some(NoPlace::FromOne(4)));
+        assert!(enter(in_network(2, 1)).is_ok());
+        assert_eq!(Origin::at("::ffff:127.0.0.1".parse().unwrap()), Origin::HERE);
+        assert_eq!(Origin::at("::ffff:192.0.2.1".parse().unwrap()), Origin::at(address(1)));
+    }
+
+    /// However many addresses strangers have, they take no place from programs of this computer.
+    #[test]
+    fn some_places_are_kept_for_this_computer() {
+        let places = Places::new(32);
+        let (strangers, _) = crowd(&places, |number| address(number as u8), 28);
+        strangers.iter().for_each(Place::is_served);
+        assert_eq!(places.enter(Origin::at(address(99)), || ()).err(), Some(NoPlace::FromOthers(28)));
+        let local: Vec<_> = (0..4).map(|_| places.enter(Origin::HERE, || ()).unwrap()).collect();
+        local.iter().for_each(Place::is_served);
+        assert_eq!(places.enter(Origin::HERE, || ()).err(), Some(NoPlace::Full(32)));
     }
 }

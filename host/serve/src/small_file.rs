@@ -25,14 +25,28 @@ pub fn read_text(path: &Path) -> io::Result<String> {
 }
 
 /// Opens a regular file without waiting, whatever it is.
-pub fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+fn open(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    open_as(path, options, true)
+}
+
+/// The same, unless it is a link.
+pub fn open_itself(path: &Path, options: &mut OpenOptions) -> io::Result<File> {
+    open_as(path, options, false)
+        .map_err(|error| if path.is_symlink() { bad("a link has taken its place".to_owned()) } else { error })
+}
+
+fn open_as(path: &Path, options: &mut OpenOptions, follows: bool) -> io::Result<File> {
     #[cfg(unix)]
     {
+        use rustix::fs::OFlags;
         use std::os::unix::fs::OpenOptionsExt;
         // A pipe that nobody writes to is opened at once, and one that nobody reads is an error.
-        options
-            .custom_flags((rustix::fs::OFlags::NONBLOCK | rustix::fs::OFlags::NOCTTY).bits().cast_signed());
+        let flags = OFlags::NONBLOCK | OFlags::NOCTTY;
+        let flags = if follows { flags } else { flags | OFlags::NOFOLLOW };
+        options.custom_flags(flags.bits().cast_signed());
     }
+    #[cfg(not(unix))]
+    let _ = follows;
     // The file that was opened is looked at, since another may be at its path meanwhile.
     match options.open(path) {
         Ok(file) if file.metadata()?.is_file() => Ok(file),

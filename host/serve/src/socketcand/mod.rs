@@ -32,7 +32,7 @@ use crate::lines::device_of;
 use crate::listen::{Listening, accept, bind};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
-use crate::places::{Place, Places, ends};
+use crate::places::{Origin, Place, Places, ends};
 use crate::{Board, News};
 use bus_feed::BusFeed;
 use command::{BadCommand, Command, Finder};
@@ -79,7 +79,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
         }
         let (stream, peer) = accept(&listener, role)?;
         let name = format!("socketcand client {peer}");
-        let place = match places.enter(Some(peer.ip()), ends(&stream)?) {
+        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
             Ok(place) => place,
             Err(full) => {
                 let _ = (&stream).write(format!("< error {full} >").as_bytes());

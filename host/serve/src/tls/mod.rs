@@ -28,7 +28,7 @@ use crate::connect::dial;
 use crate::flow::acknowledging;
 use crate::listen::{Arrival, Listening, accept, bind, let_in, turn_away};
 use crate::lock::lock;
-use crate::places::{Places, ends};
+use crate::places::{Origin, Places, ends};
 use crate::{Board, News, small_file};
 
 pub use keys::{Keys, KeysError, LIFETIME_DAYS, REVOKED};
@@ -234,7 +234,8 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
         let (stream, peer) = accept(&listener, most)?;
         let name = format!("client {peer}");
         // Who is let go is not reported: a flood of connections would be a flood of messages.
-        let Ok(handshake) = handshakes.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };
+        let origin = Origin::of(&stream, peer);
+        let Ok(handshake) = handshakes.enter(origin, ends(&stream)?) else { return Ok(()) };
         let (board, server, places) = (Arc::clone(&board), server.clone(), Arc::clone(&places));
         std::thread::Builder::new().name("cantap-tls-client".to_owned()).spawn(move || {
             let end = ends(&stream);
@@ -245,12 +246,17 @@ pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Serv
             handshake.spoke();
             let secured = welcome(stream, server.trust().config, deadline);
             drop(handshake);
-            let secured = secured.and_then(|secured| Ok((secured, places.enter(Some(peer.ip()), end?))));
+            let secured = secured.and_then(|secured| Ok((secured, places.enter(origin, end?))));
             match secured {
                 Ok(((own, secured), place)) => {
                     let (input, mut output) = secured.split();
                     let name = own.name.as_ref().map_or(name, |own| format!("{own}{AT} {peer}"));
                     let certificate = own.name.unwrap_or_default();
+                    // A session that is resumed does not show its certificate again, which may have expired meanwhile.
+                    if let Err(reason) = server.check(&own.der) {
+                        turn_away(&board, &mut output, name, &reason);
+                        return;
+                    }
                     if let Err(denied) = board.permit_of(&certificate) {
                         turn_away(&board, &mut output, name, &denied);
                         return;

@@ -16,7 +16,7 @@ use crate::audit::{AT, PAGE_OF};
 use crate::client::Identity;
 use crate::client::admission::Guest;
 use crate::listen::{Listening, accept, bind};
-use crate::places::{Place, Places, ends};
+use crate::places::{Origin, Place, Places, ends};
 use crate::shared::Refused;
 use crate::{Board, News, foreign};
 
@@ -59,7 +59,8 @@ pub fn visitors(
     let (handshakes, places) = (Places::new(MOST_HANDSHAKES), Places::new(boards[0].most_clients()));
     Listening::start("cantap-https", Some(address), move || {
         let (stream, peer) = accept(&listener, most)?;
-        let Ok(handshake) = handshakes.enter(Some(peer.ip()), ends(&stream)?) else { return Ok(()) };
+        let origin = Origin::of(&stream, peer);
+        let Ok(handshake) = handshakes.enter(origin, ends(&stream)?) else { return Ok(()) };
         let (boards, server, places) = (Arc::clone(&boards), server.clone(), Arc::clone(&places));
         let serve = Arc::clone(&serve);
         std::thread::Builder::new().name("cantap-https-visitor".to_owned()).spawn(move || {
@@ -112,7 +113,7 @@ fn introduce(
     raw.set_write_timeout(Some(WRITE_PATIENCE)).map_err(bad)?;
     let (reader, writer) = secured.split();
     let name = own.name.as_deref().map_or_else(stranger, |own| format!("{PAGE_OF}{own}{AT} {peer}"));
-    let place = places.enter(Some(peer.ip()), ends(&raw).map_err(bad)?);
+    let place = places.enter(Origin::of(&raw, peer), ends(&raw).map_err(bad)?);
     let place = place.map_err(|full| (name.clone(), full.to_string()))?;
     place.spoke();
     let role = own.role.min(most);

@@ -6,7 +6,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use cantap::device::{Link, is_idle};
 use cantap::wire::Refusal;
@@ -150,6 +150,18 @@ fn forge(
     purpose: ExtendedKeyUsagePurpose,
     years: [i32; 2],
 ) -> Files {
+    let [since, until] = years.map(|year| date_time_ymd(year, 1, 1).unix_timestamp());
+    forge_for(folder, name, hosts, purpose, [since, until])
+}
+
+/// The same, valid between two times, in seconds since 1970.
+fn forge_for(
+    folder: &Path,
+    name: &str,
+    hosts: &[&str],
+    purpose: ExtendedKeyUsagePurpose,
+    times_s: [i64; 2],
+) -> Files {
     let authority = KeyPair::from_pem(&std::fs::read_to_string(folder.join("ca-key.pem")).unwrap()).unwrap();
     let mut issuer = CertificateParams::default();
     issuer.distinguished_name = DistinguishedName::new();
@@ -158,7 +170,8 @@ fn forge(
     let hosts: Vec<String> = hosts.iter().map(|host| (*host).to_owned()).collect();
     let mut params = CertificateParams::new(hosts).unwrap();
     params.extended_key_usages = vec![purpose];
-    let [since, until] = years.map(|year| date_time_ymd(year, 1, 1));
+    let at = |s: i64| date_time_ymd(1970, 1, 1) + Duration::from_secs(s.try_into().unwrap());
+    let [since, until] = times_s.map(at);
     (params.not_before, params.not_after) = (since, until);
     let key = KeyPair::generate().unwrap();
     let certificate = params.signed_by(&key, &Issuer::from_params(&issuer, &authority)).unwrap();
@@ -213,6 +226,52 @@ fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
         let good = Keys::files(folder.path(), "good");
         assert!(tls::connect(&address, &good).is_err(), "{years:?}");
     }
+}
+
+/// A certificate that expires while its clients are connected; and TLS lets a client come back without showing it again.
+#[test]
+fn a_certificate_that_expires_lets_its_clients_go_and_not_come_back() {
+    use rustls::pki_types::pem::PemObject;
+    use rustls::pki_types::{CertificateDer, PrivateKeyDer};
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Send);
+    let now_s = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_secs() as i64;
+    let purpose = ExtendedKeyUsagePurpose::ClientAuth;
+    let files = forge_for(folder.path(), "brief", &[ROLE], purpose, [now_s - 60, now_s + 15]);
+    let mut roots = rustls::RootCertStore::empty();
+    roots.add(CertificateDer::from_pem_file(&files.authority).unwrap()).unwrap();
+    let chain = vec![CertificateDer::from_pem_file(&files.certificate).unwrap()];
+    let key = PrivateKeyDer::from_pem_file(&files.key).unwrap();
+    let config =
+        rustls::ClientConfig::builder_with_provider(Arc::new(rustls::crypto::ring::default_provider()))
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .unwrap()
+            .with_root_certificates(roots)
+            .with_client_auth_cert(chain, key)
+            .unwrap();
+    let config = Arc::new(config);
+    let dial = || {
+        let host = "localhost".try_into().unwrap();
+        let connection = rustls::ClientConnection::new(Arc::clone(&config), host).unwrap();
+        let stream = TcpStream::connect(served.listening.address().unwrap()).unwrap();
+        rustls::StreamOwned::new(connection, stream)
+    };
+    // It is given tickets for the next time.
+    let mut first = dial();
+    first.flush().unwrap();
+    first.sock.set_read_timeout(Some(Duration::from_millis(500))).unwrap();
+    assert!(first.read(&mut [0; 100]).is_err_and(|error| is_idle(&error)));
+    let device = served.connect("localhost", &files).unwrap();
+    normal(&device).unwrap();
+    let has_said = |wanted: &str| served.said.lock().unwrap().iter().any(|said| said.contains(wanted));
+    wait_until("nobody was let go", || has_said("no longer trusted"));
+    drop(device);
+    let mut again = dial();
+    let mut said = Vec::new();
+    let _ = again.read_to_end(&mut said);
+    assert_eq!(again.conn.handshake_kind(), Some(rustls::HandshakeKind::Resumed));
+    let said = String::from_utf8_lossy(&said);
+    assert!(said.contains("its certificate is no longer trusted"), "'{said}'");
 }
 
 /// Peers that stop in the middle: in TLS's first message, during the handshake a byte at a time, and after it without sending

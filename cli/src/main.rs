@@ -48,14 +48,20 @@ mod usage_error;
 #[cfg(test)]
 mod vocabulary;
 
+use std::alloc::System;
 use std::error::Error;
 use std::path::Path;
 use std::process::ExitCode;
 
+use cantap_scripts::Counting;
 use cantap_work::interrupt;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{CommandFactory, FromArgMatches, Parser};
 use clap_complete::CompleteEnv;
+
+/// Counted for scripts, whose memory is limited.
+#[global_allocator]
+static ALLOCATOR: Counting<System> = Counting(System);
 
 /// Captures, understands and drives CAN buses with a cantap analyser.
 #[derive(Parser)]

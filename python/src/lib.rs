@@ -22,13 +22,14 @@ mod table;
 mod traces;
 mod values;
 
+use cantap_scripts::Counting;
 use mimalloc::MiMalloc;
 use pyo3::prelude::*;
 
 /// Columns are megabytes that are freed and wanted again. The system's allocator returns them to the kernel each time, and getting them back page by
-/// page took a quarter of the time of decoding.
+/// page took a quarter of the time of decoding. Counted for scripts, whose memory is limited.
 #[global_allocator]
-static ALLOCATOR: MiMalloc = MiMalloc;
+static ALLOCATOR: Counting<MiMalloc> = Counting(MiMalloc);
 
 /// Devices, trace files and signals, for the package `cantap`.
 #[pymodule]

@@ -14,7 +14,7 @@ use cantap::{Channel, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::WriteOptions;
 use cantap_scripts::library::{self, LibraryError, ReadyNode};
-use cantap_scripts::{Bench, Live, Message, Outcome, Report, Script, TestResult};
+use cantap_scripts::{Bench, BrokenOff, Live, LiveError, Message, Outcome, Report, Script, TestResult};
 use cantap_trace::clean;
 use cantap_virtual::Options;
 use cantap_work::{atomic_file, interrupt, rounded};
@@ -139,6 +139,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(path) = &args.output {
         refuse_older(path, args.force)?;
     }
+    if let Some(path) = &args.junit {
+        refuse_no_place(path)?;
+    }
     interrupt::watch()?;
     let mut trace = match &args.output {
         Some(path) => Some(TraceOutput::create(path, &WriteOptions::default(), args.device.is_some())?),
@@ -154,10 +157,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let mut on_message = |message: Message| tell(&message, args.json);
     let mut goes_on = || !interrupt::requested();
-    let report = match &args.device {
+    let (report, broken) = match &args.device {
         None => {
             let bench = args.bench(decoder)?;
-            bench.run(&scripts, &mut on_record, &mut on_message, &mut goes_on)?
+            (bench.run(&scripts, &mut on_record, &mut on_message, &mut goes_on)?, None)
         }
         Some(address) => {
             let device = address.open()?;
@@ -168,13 +171,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             let mut next_key = || keyboard.as_mut().and_then(Keyboard::next);
             let keys: Option<&mut dyn FnMut() -> Option<char>> =
                 if has_keyboard { Some(&mut next_key) } else { None };
-            let result = live.run(&device, &scripts, &mut on_record, &mut on_message, keys, &mut goes_on);
-            if result.is_ok() {
-                device.stop()?;
+            match live.run(&device, &scripts, &mut on_record, &mut on_message, keys, &mut goes_on) {
+                Ok(report) => (report, device.stop().err().map(anyhow::Error::from)),
+                Err(broken) => match *broken {
+                    BrokenOff { error: error @ LiveError::Script(_), .. } => return Err(error.into()),
+                    // What was on the bus until then, and the tests' results, are not lost with the device.
+                    BrokenOff { error, report } => (report, Some(error.into())),
+                },
             }
-            result?
         }
     };
+    print(&report, args.json)?;
     if let Some(error) = failed {
         return Err(error);
     }
@@ -183,7 +190,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         atomic_file::write(path, report.junit().as_bytes())
             .with_context(|| format!("cannot write {}", path.display()))?;
     }
-    print(&report, args.json)?;
+    if let Some(error) = broken {
+        return Err(error);
+    }
     if !report.without_keys.is_empty() {
         eprintln!("{}", no_keys(&report.without_keys, args.device.is_some()));
     }
@@ -191,6 +200,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bail!("ended before the scripts were done");
     }
     Ok(if report.is_success() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// Refuses, before a run that may take hours, a file that cannot be written after it.
+fn refuse_no_place(path: &Path) -> anyhow::Result<()> {
+    if path.is_dir() {
+        bail!("cannot write {}: it is a folder", path.display());
+    }
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+        bail!("cannot write {}: there is no folder {}", path.display(), folder.display());
+    }
+    Ok(())
 }
 
 impl Args {
@@ -326,7 +347,7 @@ fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
         if report.frames_not_sent > 0 {
             writeln!(
                 out,
-                "{} frames were not sent: nobody acknowledged them, or the run ended first",
+                "{} frames were not sent: nobody acknowledged them, or their script or the run ended first",
                 report.frames_not_sent
             )?;
         }

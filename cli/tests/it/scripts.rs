@@ -197,3 +197,30 @@ fn ready_nodes_are_listed_printed_and_run_as_printed() {
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(text(&output.stdout).contains("it has no setting colour; it has codes"), "{output:?}");
 }
+
+#[test]
+fn a_place_where_no_results_can_be_written_is_refused_before_the_run() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("a.rhai"), "log(\"begun\"); fn test_a() {}").unwrap();
+    for place in [".", "nowhere/report.xml"] {
+        let output = run(folder.path(), &["a.rhai", "--junit", place]);
+        assert!(!output.status.success() && output.stdout.is_empty(), "{output:?}");
+        assert!(text(&output.stderr).contains(&format!("cannot write {place}: ")), "{output:?}");
+    }
+    // A device, as if the disk were full: the results are at least shown.
+    #[cfg(target_os = "linux")]
+    {
+        let output = run(folder.path(), &["a.rhai", "--junit", "/dev/full"]);
+        assert_eq!(output.status.code(), Some(1), "{output:?}");
+        assert!(text(&output.stdout).contains("1 passed"), "{output:?}");
+    }
+}
+
+#[test]
+fn a_test_that_the_run_did_not_wait_for_is_no_success() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("a.rhai"), "fn test_a() { wait(\"2s\"); }").unwrap();
+    let output = run(folder.path(), &["a.rhai", "--for", "1s"]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert!(text(&output.stdout).contains("the run was over, after 1 s, before it had ended"), "{output:?}");
+}

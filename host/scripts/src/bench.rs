@@ -139,15 +139,28 @@ impl Wire {
 /// A script's controller on one bus.
 struct Attached {
     bitrate_bps: u32,
-    /// Each frame, and whether it is a repeated one.
-    to_send: VecDeque<(Frame, bool)>,
+    /// Each frame, and the handle of its repetition if it is a repeated one.
+    to_send: VecDeque<(Frame, Option<u32>)>,
+    /// Whether the first of them is on the bus.
+    is_sending: bool,
     received: Vec<(Frame, Whose)>,
     errors: Vec<BusErrorKind>,
 }
 
 impl Attached {
+    /// Whether a repetition's last frame has not been sent yet.
+    fn holds(&self, handle: u32) -> bool {
+        self.to_send.iter().any(|(_, of)| *of == Some(handle))
+    }
+
     const fn new(bitrate_bps: u32) -> Self {
-        Self { bitrate_bps, to_send: VecDeque::new(), received: Vec::new(), errors: Vec::new() }
+        Self {
+            bitrate_bps,
+            to_send: VecDeque::new(),
+            is_sending: false,
+            received: Vec::new(),
+            errors: Vec::new(),
+        }
     }
 }
 
@@ -177,21 +190,25 @@ impl BusNode for Attached {
         false
     }
 
-    fn on_start(&mut self) {}
+    fn on_start(&mut self) {
+        self.is_sending = true;
+    }
 
     fn on_lost(&mut self) {}
 
     fn on_frame(&mut self, frame: &Frame, own: bool) {
         let sent = if own { self.to_send.pop_front() } else { None };
+        self.is_sending &= !own;
         let whose = match (own, sent) {
             (false, _) => Whose::Others,
-            (true, Some((_, true))) => Whose::Repeated,
+            (true, Some((_, Some(_)))) => Whose::Repeated,
             (true, _) => Whose::Own,
         };
         self.received.push((*frame, whose));
     }
 
-    fn on_error(&mut self, kind: BusErrorKind, _own: bool) {
+    fn on_error(&mut self, kind: BusErrorKind, own: bool) {
+        self.is_sending &= !own;
         self.errors.push(kind);
     }
 
@@ -239,14 +256,12 @@ impl Simulation {
         let Some(node) = self.nodes.get_mut(place) else { return };
         node.end();
         self.repeats.retain(|repeat| repeat.node != place);
-        for wire in &mut self.buses {
-            wire.nodes[place].to_send.truncate(1);
-        }
+        self.drop_waiting(place);
     }
 
     /// Queues a frame of the caller's own controller.
     pub fn send(&mut self, channel: Channel, frame: Frame) {
-        self.buses[channel.index()].own.to_send.push_back((frame, false));
+        self.buses[channel.index()].own.to_send.push_back((frame, None));
     }
 
     /// Sends a frame of the caller's now and then again after each period, until the next call with the same handle: with another frame
@@ -284,7 +299,8 @@ impl Simulation {
     fn step(&mut self, end_ns: u64) -> bool {
         let now_ns = self.now_ns;
         let of_scripts = self.nodes.iter().filter_map(|node| node.wake_ns).min().unwrap_or(NEVER);
-        let of_repeats = self.repeats.iter().map(|repeat| repeat.due_ns).min().unwrap_or(NEVER);
+        let of_repeats = self.repeats.iter().filter(|repeat| !self.waits(repeat));
+        let of_repeats = of_repeats.map(|repeat| repeat.due_ns).min().unwrap_or(NEVER);
         let of_keys = self.keys.front().map_or(NEVER, |(at_ns, _)| *at_ns);
         let mut next_ns = of_scripts.min(of_repeats).min(of_keys);
         for wire in &mut self.buses {
@@ -361,14 +377,29 @@ impl Simulation {
         }
     }
 
+    fn controller_of(&self, repeat: &Repeat) -> &Attached {
+        let Wire { nodes, own, .. } = &self.buses[repeat.channel.index()];
+        nodes.get(repeat.node).unwrap_or(own)
+    }
+
+    /// Whether the last frame of a repetition has not been sent yet: until then it is not due again, as in a device.
+    fn waits(&self, repeat: &Repeat) -> bool {
+        self.controller_of(repeat).holds(repeat.handle)
+    }
+
     /// Queues the repeated frames that are due.
     fn queue_repeated(&mut self) {
-        for repeat in &mut self.repeats {
-            if repeat.due_ns <= self.now_ns {
-                repeat.due_ns += repeat.period_ns;
-                let Wire { nodes, own, .. } = &mut self.buses[repeat.channel.index()];
-                nodes.get_mut(repeat.node).unwrap_or(own).to_send.push_back((repeat.frame, true));
+        for place in 0..self.repeats.len() {
+            let repeat = &self.repeats[place];
+            if repeat.due_ns > self.now_ns || self.waits(repeat) {
+                continue;
             }
+            let repeat = &mut self.repeats[place];
+            // What was due while the last one waited is left out.
+            repeat.due_ns += ((self.now_ns - repeat.due_ns) / repeat.period_ns + 1) * repeat.period_ns;
+            let (frame, handle) = (repeat.frame, repeat.handle);
+            let Wire { nodes, own, .. } = &mut self.buses[repeat.channel.index()];
+            nodes.get_mut(repeat.node).unwrap_or(own).to_send.push_back((frame, Some(handle)));
         }
     }
 
@@ -386,11 +417,12 @@ impl Simulation {
         let node = &mut self.nodes[place];
         let outputs = node.resume(self.now_ns, input);
         let name = node.name.clone();
-        let has_ended = node.has_ended;
+        let (has_ended, has_failed) = (node.has_ended, node.error.is_some());
         for output in outputs {
             match self.results.take(&name, self.now_ns, output) {
+                Some(Output::Send { .. }) if has_failed => self.results.report.frames_not_sent += 1,
                 Some(Output::Send { channel, frame }) => {
-                    self.buses[channel.index()].nodes[place].to_send.push_back((frame, false));
+                    self.buses[channel.index()].nodes[place].to_send.push_back((frame, None));
                 }
                 Some(Output::Repeat { handle, channel, frame, period_ns }) => {
                     let known = self
@@ -419,12 +451,25 @@ impl Simulation {
             // A node that is gone sends nothing more.
             self.repeats.retain(|repeat| repeat.node != place);
         }
+        if has_failed {
+            self.drop_waiting(place);
+        }
+    }
+
+    /// What a node's controllers have not begun to send is not sent.
+    fn drop_waiting(&mut self, place: usize) {
+        for wire in &mut self.buses {
+            let Attached { to_send, is_sending, .. } = &mut wire.nodes[place];
+            let kept = usize::from(*is_sending);
+            self.results.report.frames_not_sent += to_send.len().saturating_sub(kept) as u64;
+            to_send.truncate(kept);
+        }
     }
 
     /// How it went, and what was logged last.
     pub fn finish(mut self) -> (Report, Vec<Message>) {
         let waiting = self.buses.iter().flat_map(|wire| &wire.nodes).map(|node| node.to_send.len() as u64);
-        self.results.report.frames_not_sent = waiting.sum();
+        self.results.report.frames_not_sent += waiting.sum::<u64>();
         let messages = self.take_messages();
         (self.results.finish(&self.nodes, self.now_ns), messages)
     }

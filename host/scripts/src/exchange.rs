@@ -51,6 +51,18 @@ pub enum Output {
     Test { name: String, outcome: Outcome, began_ns: u64 },
 }
 
+impl Output {
+    /// Bytes of its texts.
+    pub fn text_bytes(&self) -> usize {
+        match self {
+            Self::Log(text) | Self::TestBegan(text) => text.capacity(),
+            Self::Test { name, outcome: Outcome::Failed(reason), .. } => name.capacity() + reason.capacity(),
+            Self::Test { name, .. } => name.capacity(),
+            Self::Send { .. } | Self::Repeat { .. } | Self::EndRepeat { .. } => 0,
+        }
+    }
+}
+
 /// The script's turn ends.
 #[derive(Debug)]
 pub struct Turn {

@@ -296,6 +296,10 @@ pub fn describe(error: &rhai::EvalAltResult) -> String {
         rhai::EvalAltResult::ErrorTerminated(reason, at) | rhai::EvalAltResult::ErrorRuntime(reason, at) => {
             with_line(&reason.to_string(), *at)
         }
+        rhai::EvalAltResult::ErrorStackOverflow(at) => with_line(
+            "Stack overflow: too many calls are nested; while a function waits, the others are called, and it again",
+            *at,
+        ),
         other => other.to_string(),
     }
 }

@@ -7,7 +7,7 @@
 //!
 //! [`twin`] learns a bus from a trace and writes the scripts that play it.
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 mod bench;
 mod byte_functions;
@@ -18,6 +18,8 @@ mod functions;
 mod handlers;
 pub mod library;
 mod live;
+#[expect(unsafe_code, reason = "an allocator is")]
+mod memory;
 mod node;
 mod placement;
 mod report;
@@ -34,7 +36,8 @@ pub mod twin;
 
 pub use bench::{Bench, Simulation};
 pub use explain::Explained;
-pub use live::{Live, LiveError, LiveRun, ScriptCounts, ScriptEvent, ScriptThread};
+pub use live::{BrokenOff, Live, LiveError, LiveRun, ScriptCounts, ScriptEvent, ScriptThread};
+pub use memory::Counting;
 pub use node::{Script, ScriptError};
 pub use placement::{Placement, Runner, Statement, Target, TimedBy};
 pub use report::{Message, Outcome, Report, TestResult};

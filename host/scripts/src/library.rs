@@ -1,11 +1,15 @@
 //! Ready nodes: scripts that come with the program.
 
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
 use std::path::Path;
 
 use crate::node::Script;
 use crate::sheets;
 
+/// No script is larger, in bytes: that of a bus of a thousand identifiers has a tenth of it.
+const MOST_BYTES: u64 = 16 << 20;
 /// What the name of a ready node begins with.
 pub const PREFIX: &str = "node:";
 
@@ -51,6 +55,12 @@ pub enum LibraryError {
         path: String,
         /// Why not.
         reason: String,
+    },
+    /// A script's file is larger than any script.
+    #[error("{path} is no script: it has more than {} MiB", MOST_BYTES >> 20)]
+    TooLarge {
+        /// The file.
+        path: String,
     },
     /// A script's file is no text.
     #[error("{path} is no script: it is not text in UTF-8")]
@@ -108,8 +118,13 @@ pub fn read(path: &Path) -> Result<Script, LibraryError> {
         return script(name);
     }
     let name = path.display().to_string();
-    let bytes = std::fs::read(path)
+    let mut bytes = Vec::new();
+    File::open(path)
+        .and_then(|file| file.take(MOST_BYTES + 1).read_to_end(&mut bytes))
         .map_err(|error| LibraryError::File { path: name.clone(), reason: error.to_string() })?;
+    if bytes.len() as u64 > MOST_BYTES {
+        return Err(LibraryError::TooLarge { path: name });
+    }
     match String::from_utf8(bytes) {
         Ok(source) => Ok(Script::new(name, source)),
         Err(_) => Err(LibraryError::NoText { path: name }),

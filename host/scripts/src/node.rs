@@ -14,11 +14,8 @@ use rhai::{AST, Engine, Scope};
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::functions;
 use crate::runtime::Runtime;
-use crate::sandbox::{self, ENDED, Operations};
+use crate::sandbox::{self, ENDED, Operations, STACK_BYTES};
 
-/// The stack of a script's thread: enough for the deepest calls that it may make, with functions of the bus in between, also without
-/// optimisation.
-const STACK_BYTES: usize = 64 << 20;
 /// The functions whose names begin so are tests.
 const TEST_PREFIX: &str = "test_";
 
@@ -123,8 +120,12 @@ fn tail_of(ast: &AST, source: &str) -> String {
 pub struct Node {
     /// Its name.
     pub name: String,
-    /// Whether it has tests: the run ends with the last one.
-    pub has_tests: bool,
+    /// Its tests, in their order: the run ends with the last one.
+    pub tests: Vec<String>,
+    /// How many of them have ended.
+    pub tests_ended: usize,
+    /// When the one after these began, in nanoseconds since the run began.
+    pub test_began_ns: Option<u64>,
     /// When it is to be woken, if nothing happens before.
     pub wake_ns: Option<u64>,
     /// Whether it has ended.
@@ -160,7 +161,7 @@ impl Node {
         seed: u64,
         stop: Arc<AtomicBool>,
     ) -> Result<Self, ScriptError> {
-        let has_tests = !script.tests()?.is_empty();
+        let tests = script.tests()?;
         let (to, resume) = sync_channel(1);
         let (turn, from) = sync_channel(1);
         let (own, decoder, stops) = (script.clone(), Arc::clone(decoder), Arc::clone(&stop));
@@ -171,7 +172,9 @@ impl Node {
             .map_err(|error| ScriptError::Thread { name: script.name.clone(), reason: error.to_string() })?;
         Ok(Self {
             name: script.name.clone(),
-            has_tests,
+            tests,
+            tests_ended: 0,
+            test_began_ns: None,
             wake_ns: Some(0),
             has_ended: false,
             error: None,
@@ -215,6 +218,16 @@ impl Node {
             next: Next::End { error: Some("the script's thread has died; please report this".to_owned()) },
         };
         let Turn { outputs, next } = turn.unwrap_or_else(lost);
+        for output in &outputs {
+            match output {
+                Output::TestBegan(_) => self.test_began_ns = Some(now_ns),
+                Output::Test { .. } => {
+                    self.tests_ended += 1;
+                    self.test_began_ns = None;
+                }
+                Output::Send { .. } | Output::Repeat { .. } | Output::EndRepeat { .. } | Output::Log(_) => {}
+            }
+        }
         match next {
             Next::Wait { until_ns, inputs } => {
                 self.wake_ns = until_ns;
@@ -259,6 +272,7 @@ fn run(
         let ast = script.compile(&engine).map_err(|error| error.to_string())?;
         let tail = engine.compile(tail_of(&ast, &script.source)).map_err(|error| error.to_string())?;
         let mut scope = Scope::new();
+        operations.begin();
         engine.run_ast_with_scope(&mut scope, &ast).map_err(|error| functions::describe(&error))?;
         // Its own lines have asked for all settings that it knows.
         runtime.settings.check()?;

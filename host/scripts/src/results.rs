@@ -85,9 +85,27 @@ impl Results {
         self.last.iter().map(line).collect()
     }
 
-    /// The report of a run that is over.
+    /// The report of a run that is over. A test that has not ended by then has not passed.
     pub fn finish(mut self, nodes: &[Node], now_ns: u64) -> Report {
         self.report.duration_ns = now_ns;
+        for node in nodes.iter().filter(|node| !node.has_ended) {
+            let mut began_ns = node.test_began_ns;
+            for name in node.tests.iter().skip(node.tests_ended) {
+                let (what, trace) =
+                    if began_ns.is_some() { ("ended", self.trace()) } else { ("begun", Vec::new()) };
+                let seconds = now_ns as f64 / 1e9;
+                self.report.tests.push(TestResult {
+                    script: node.name.clone(),
+                    name: name.clone(),
+                    outcome: Outcome::Failed(format!(
+                        "the run was over, after {seconds} s, before it had {what}"
+                    )),
+                    began_ns: began_ns.take().unwrap_or(now_ns),
+                    ended_ns: now_ns,
+                    trace,
+                });
+            }
+        }
         let errors = nodes.iter().filter_map(|node| Some((node.name.clone(), node.error.clone()?)));
         self.report.errors.extend(errors);
         self.report
@@ -96,7 +114,7 @@ impl Results {
 
 /// Whether a run is over: every script with tests has ended, or, if none has tests, every script has.
 pub fn is_over(nodes: &[Node]) -> bool {
-    let mut deciding = nodes.iter().filter(|node| node.has_tests).peekable();
+    let mut deciding = nodes.iter().filter(|node| !node.tests.is_empty()).peekable();
     if deciding.peek().is_some() {
         deciding.all(|node| node.has_ended)
     } else {

@@ -14,6 +14,7 @@ use rhai::{Dynamic, EvalAltResult, FnPtr, FuncArgs, Map, NativeCallContext};
 
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
+use crate::memory;
 use crate::sandbox::{ENDED, Operations};
 use crate::script_frame::ScriptFrame;
 use crate::script_result::Result;
@@ -325,6 +326,8 @@ impl Runtime {
     /// The turn ends.
     fn hand_over(&self, next: Next) -> Result<()> {
         let outputs = std::mem::take(&mut self.state.borrow_mut().outputs);
+        let texts: usize = outputs.iter().map(Output::text_bytes).sum();
+        memory::hand_over(outputs.capacity() * size_of::<Output>() + texts);
         self.turn.send(Turn { outputs, next }).map_err(|_| Box::new(ended()))
     }
 

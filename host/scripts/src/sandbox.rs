@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 use rhai::Engine;
 
+use crate::memory;
+
 /// Operations of a script between two waits. A simple loop with ten million takes a few seconds, far longer than any node may be silent.
 const MAX_OPERATIONS: u64 = 10_000_000;
 /// How long a script may compute between two waits, by the computer's clock. Operations on large arrays take long each, and longer the deeper
@@ -21,6 +23,12 @@ const MAX_ARRAY: usize = 1 << 20;
 const MAX_MAP: usize = 1 << 16;
 /// Bytes of a text, or of all texts in an array or a map.
 const MAX_STRING: usize = 1 << 24;
+/// Bytes of everything that a script keeps besides its text: many values that are each within their limits are too many.
+const MAX_MEMORY: usize = if cfg!(target_pointer_width = "64") { 64 << 20 } else { 16 << 20 };
+/// The stack of a script's thread, of which only what is used takes memory. Values that hold each other in a chain as long as the memory allows
+/// are freed one within the other: that takes up to 7.6 times their own bytes without optimisation. The deepest calls with functions of the bus in
+/// between take a fraction of it.
+pub const STACK_BYTES: usize = 8 * MAX_MEMORY;
 /// Variables at the same time.
 const MAX_VARIABLES: usize = 4096;
 
@@ -29,6 +37,8 @@ const MAX_VARIABLES: usize = 4096;
 pub struct Operations {
     used: Rc<Cell<Used>>,
     stop: Arc<AtomicBool>,
+    /// Bytes that the script had before it ran.
+    text_bytes: Rc<Cell<usize>>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -41,7 +51,12 @@ struct Used {
 impl Operations {
     /// Of a script that ends when this becomes true, also in the middle of a computation.
     pub fn until(stop: Arc<AtomicBool>) -> Self {
-        Self { used: Rc::default(), stop }
+        Self { stop, ..Self::default() }
+    }
+
+    /// The script's text has been read, and it begins: what it has by now is not its values'.
+    pub fn begin(&self) {
+        self.text_bytes.set(memory::used());
     }
 
     /// The script waits: it may use as many again.
@@ -59,6 +74,9 @@ impl Operations {
     fn count(&self) -> Option<&'static str> {
         if self.stop.load(Ordering::Relaxed) {
             return Some(ENDED);
+        }
+        if memory::used() > self.text_bytes.get() + MAX_MEMORY {
+            return Some(TOO_LARGE);
         }
         self.spend(1);
         let Used { operations, since } = self.used.get();
@@ -91,3 +109,6 @@ pub const ENDED: &str = "ended";
 
 /// Why a script was ended that did not wait.
 pub const TOO_LONG: &str = "it computed for too long, or logged too much, without waiting; put a wait(\"1ms\") into its loop, or react to frames with on_frame";
+
+/// Why a script was ended that kept too much.
+pub const TOO_LARGE: &str = "it uses too much memory; keep less in its variables, lists and functions";

@@ -17,7 +17,7 @@ use crate::report::{Message, Report};
 pub use events::{ScriptCounts, ScriptEvent};
 use run::Keys;
 pub use run::LiveRun;
-pub use settings::{Live, LiveError};
+pub use settings::{BrokenOff, Live, LiveError};
 pub use thread::ScriptThread;
 
 impl Live {
@@ -29,7 +29,7 @@ impl Live {
     /// At the end, however it comes, nothing is repeated any more.
     ///
     /// # Errors
-    /// If a script is not in the language, or the device is gone; what else goes wrong is in the report.
+    /// If a script is not in the language, or the device is gone, with the report until then; what else goes wrong is in the report.
     pub fn run(
         &self,
         device: &Device,
@@ -38,18 +38,25 @@ impl Live {
         on_message: &mut dyn FnMut(Message),
         keys: Option<&mut dyn FnMut() -> Option<char>>,
         goes_on: &mut dyn FnMut() -> bool,
-    ) -> Result<Report, LiveError> {
+    ) -> Result<Report, Box<BrokenOff>> {
         if scripts.is_empty() {
-            return Err(ScriptError::None.into());
+            return Err(broken_off(ScriptError::None.into(), Report::default()));
         }
         let mut run = self.start(device);
         for script in scripts {
-            run.add(script)?;
+            run.add(script).map_err(|error| broken_off(error.into(), Report::default()))?;
         }
         let keys = keys.map(|next| Box::new(next) as Keys<'_>);
         let result = run.go(device.records(), self.duration, on_record, on_message, keys, goes_on);
         let (report, messages) = run.finish();
         messages.into_iter().for_each(on_message);
-        result.map(|()| report)
+        match result {
+            Ok(()) => Ok(report),
+            Err(error) => Err(broken_off(error, report)),
+        }
     }
+}
+
+fn broken_off(error: LiveError, report: Report) -> Box<BrokenOff> {
+    Box::new(BrokenOff { error, report })
 }

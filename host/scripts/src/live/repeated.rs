@@ -8,6 +8,9 @@ use super::run::LiveRun;
 use super::settings::LiveError;
 use crate::placement::{Runner, Statement};
 
+/// The shortest period that a device keeps: no frame is shorter at 1 Mbit/s.
+const SHORTEST_NS: u64 = 47_000;
+
 impl LiveRun<'_> {
     pub(super) fn repeat_of(
         &mut self,
@@ -20,19 +23,21 @@ impl LiveRun<'_> {
         let used: Vec<u8> =
             self.slots.iter().filter(|((of, _, _), _)| *of == index).map(|(_, slot)| *slot).collect();
         let known = self.slots.get(&(index, place, handle)).copied();
-        let is_of_device = Statement::Periodic.place(self.target, used.len()).runner == Runner::Device;
+        let ticks = u128::from(period_ns) * u128::from(self.tick_hz) / 1_000_000_000;
+        // Its clock has 32 bits for a period.
+        let period_ticks = u32::try_from(ticks).ok().filter(|_| period_ns >= SHORTEST_NS);
+        let is_of_device = period_ticks.is_some()
+            && Statement::Periodic.place(self.target, used.len()).runner == Runner::Device;
         // From the last one down: whoever shares the session takes them from the first one up.
         let free = || {
             let mut slots = (0..self.periodic_slots).rev();
             slots.find(|slot| is_of_device && !used.contains(slot) && self.port.claim(channel, *slot))
         };
         let slot = known.or_else(free);
-        let Some(slot) = slot else {
+        let (Some(slot), Some(period_ticks)) = (slot, period_ticks) else {
             self.repeat_from_here((place, handle), channel, frame, period_ns);
             return Ok(());
         };
-        let ticks = u128::from(period_ns) * u128::from(self.tick_hz) / 1_000_000_000;
-        let period_ticks = u32::try_from(ticks).unwrap_or(u32::MAX).max(1);
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
         self.port.set_periodic(place, channel, slot, Some(entry))?;
         self.repeated.insert((index, slot), place);

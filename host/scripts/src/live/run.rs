@@ -404,8 +404,12 @@ impl LiveRun<'_> {
         let Some(node) = self.nodes.get_mut(place) else { return Ok(()) };
         let outputs = node.resume(self.now_ns, input);
         let name = node.name.clone();
+        let has_failed = node.error.is_some();
         for output in outputs {
             match self.results.take(&name, self.now_ns, output) {
+                // What it sent before its error, without a wait, it sent at the same moment.
+                Some(Output::Send { .. }) if has_failed => self.results.report.frames_not_sent += 1,
+                Some(Output::Repeat { .. }) if has_failed => {}
                 Some(Output::Send { channel, frame }) => self.send_of(place, (channel, frame), true)?,
                 Some(Output::Repeat { handle, channel, frame, period_ns }) => {
                     self.repeat_of(place, (handle, channel), frame, period_ns)?;

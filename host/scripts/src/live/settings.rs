@@ -7,6 +7,7 @@ use cantap::DeviceError;
 use cantap_signals::Decoder;
 
 use crate::node::ScriptError;
+use crate::report::Report;
 
 /// What a run on a device needs.
 #[derive(Clone, Debug)]
@@ -32,4 +33,15 @@ pub enum LiveError {
     /// Whoever has the device does not want the scripts any more.
     #[error("the scripts' session with the device is over")]
     Over,
+}
+
+/// A run on a device that broke off, and what it had come to.
+#[derive(Debug, thiserror::Error)]
+#[error("{error}")]
+pub struct BrokenOff {
+    /// Why.
+    #[source]
+    pub error: LiveError,
+    /// How it went until then.
+    pub report: Report,
 }

@@ -174,3 +174,30 @@ fn keys_are_typed_at_their_times_and_a_script_for_which_none_come_is_named() {
     let (report, ..) = run(5, &[script("keys", "on_key(\"ab\", || 0);")]);
     assert!(failure(&report).contains("\"ab\" is not one key"), "{report:?}");
 }
+
+/// A run that was over too soon says nothing of a test: that is no success.
+#[test]
+fn a_test_that_has_not_ended_with_the_run_has_failed() {
+    let source =
+        "fn test_a() { wait(\"100ms\"); } fn test_b() { send(\"123#42\"); wait(\"10s\"); } fn test_c() { }";
+    let (report, _, _) = run(2, &[script("a", source), script("b", "every(\"1s\", || 0);")]);
+    assert!(!report.is_success());
+    let reasons: Vec<_> = report
+        .tests
+        .iter()
+        .map(|test| match &test.outcome {
+            Outcome::Passed => (test.name.as_str(), "passed"),
+            Outcome::Failed(reason) => (test.name.as_str(), reason.as_str()),
+        })
+        .collect();
+    assert_eq!(
+        reasons,
+        [
+            ("test_a", "passed"),
+            ("test_b", "the run was over, after 2 s, before it had ended"),
+            ("test_c", "the run was over, after 2 s, before it had begun"),
+        ]
+    );
+    assert_eq!((report.tests[1].began_ns, report.tests[1].ended_ns), (100_000_000, 2_000_000_000));
+    assert_eq!(report.tests[1].trace.len(), 1);
+}

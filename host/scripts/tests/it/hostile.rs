@@ -103,3 +103,74 @@ fn what_is_kept_for_a_script_is_limited() {
     );
     assert!(report.is_success(), "{report:?}");
 }
+
+/// Each of these keeps many values, none of which is too large by itself.
+#[test]
+fn what_a_script_keeps_as_a_whole_is_limited() {
+    let text = "let s = \"x\"; s.pad(1000000, \"y\"); ";
+    for keeps in [
+        "let all = []; for i in 0..100000 { all.push(steps([s + i])); }",
+        "let all = []; fn f(text) {} for i in 0..100000 { all.push(Fn(\"f\").curry(s + i)); }",
+        "for i in 0..8000 { let t = s + i; after(\"1h\", || t.len()); }",
+        // Also a little in each turn.
+        "let all = []; for i in 0..100000 { all.push(steps([s + i])); wait(\"1ms\"); }",
+    ] {
+        assert!(error(&format!("{text}{keeps}")).contains("too much memory"), "{keeps}");
+    }
+    // What it no longer has, and what it has logged, does not count.
+    let (report, _, _) = run(
+        600,
+        &[script("a", &format!("{text} for i in 0..200 {{ log(steps([s + i]).next()); wait(\"1ms\"); }}"))],
+    );
+    assert!(report.is_success(), "{:?}", report.errors);
+}
+
+/// Freed one within the other, these would overflow a thread's usual stack, and end the whole program.
+#[test]
+fn a_chain_of_values_as_long_as_the_memory_allows_ends_only_its_script() {
+    let waits = "if i % 10000 == 0 { wait(\"1us\"); }";
+    for chain in [
+        format!("let last = (); for i in 0..2000000 {{ last = steps([last]); {waits} }}"),
+        format!("let f = || 1; for i in 0..2000000 {{ let g = f; f = || g; {waits} }}"),
+    ] {
+        assert!(error(&chain).contains("too much memory"), "{chain}");
+    }
+}
+
+/// What it sends and then fails, without a wait, happens at one moment: nothing of it is sent after its error.
+#[test]
+fn nothing_of_a_script_is_sent_after_its_error() {
+    let ends = |source: &str| {
+        let (report, records, _) = run(1, &[script("a", source)]);
+        assert_eq!(report.errors.len(), 1, "{report:?}");
+        (records.len(), report.frames_sent, report.frames_not_sent)
+    };
+    assert_eq!(ends("for i in 0..100 { send(\"123#\"); } fail(\"no\");"), (0, 0, 100));
+    assert_eq!(ends("send(\"123#\"); loop {}"), (0, 0, 1));
+    // 47 bits of 2 us each: the first frame is sent, the second is on the bus.
+    let (sent, _, dropped) = ends("for i in 0..100 { send(\"123#\"); } wait(\"150us\"); fail(\"no\");");
+    assert_eq!((sent, dropped), (2, 98));
+}
+
+/// As in a device: a frame that waits for the bus is not due again.
+#[test]
+fn a_repeated_frame_that_the_bus_does_not_take_does_not_pile_up() {
+    let fast = script("fast", "periodic(\"200#0102030405060708\", \"1ns\");");
+    let (report, records, _) = run(1, &[fast]);
+    // A frame of eight bytes has 111 to 135 bits.
+    assert!((3700..=4600).contains(&records.len()), "{}", records.len());
+    assert!(report.frames_not_sent <= 1, "{report:?}");
+    // Behind another that the bus is full of, it waits, and once.
+    let high =
+        script("high", "periodic(\"100#0102030405060708\", \"1us\"); after(\"500ms\", || fail(\"over\"));");
+    let low = script("low", "periodic(\"200#0102030405060708\", \"10ms\");");
+    let (_, records, _) = run(1, &[high, low]);
+    let low = records.iter().filter(|record| record.frame().unwrap().to_string().starts_with("200"));
+    assert!((50..=52).contains(&low.count()));
+}
+
+#[test]
+fn a_function_that_waits_while_it_is_called_again_and_again_says_so() {
+    let reason = error("on_frame(|f| wait(\"10s\")); every(\"1ms\", || wait(\"1s\"));");
+    assert!(reason.contains("while a function waits"), "{reason}");
+}

@@ -1,9 +1,10 @@
 //! Scripts on the virtual device, as on a board.
 
+use std::cell::Cell;
 use std::time::Duration;
 
 use cantap::{Channel, Device, TraceEvent, TraceRecord};
-use cantap_scripts::{Live, Report, Script};
+use cantap_scripts::{Live, Message, Outcome, Report, Script};
 
 use super::{decoder, failure, script};
 
@@ -60,17 +61,23 @@ fn two_scripts_on_one_device_hear_each_other_and_repetitions_end_with_the_run() 
 #[test]
 fn a_device_that_vanishes_is_an_error_and_not_a_hang() {
     let device = device("load=0");
-    let scripts = [script("a", r#"every("1ms", || send("100#"));"#)];
+    let source =
+        r#"every("1ms", || send("100#")); fn test_a() { log("a"); } fn test_b() { log("b"); wait("1h"); }"#;
+    let is_in_b = Cell::new(false);
     let mut turns = 0;
     let live = Live { decoder: decoder(), seed: 1, duration: None };
-    let error = live.run(&device, &scripts, &mut |_| {}, &mut |_| {}, None, &mut || {
-        turns += 1;
+    let mut on_message = |message: Message| is_in_b.set(is_in_b.get() || message.text == "b");
+    let broken = live.run(&device, &[script("a", source)], &mut |_| {}, &mut on_message, None, &mut || {
+        turns += u32::from(is_in_b.get());
         if turns == 20 {
             let _ = device.reset();
         }
         true
     });
-    assert!(error.is_err(), "{error:?}");
+    // What was found out until then is not lost, and what was not has not passed.
+    let report = broken.unwrap_err().report;
+    let passed: Vec<bool> = report.tests.iter().map(|test| test.outcome == Outcome::Passed).collect();
+    assert_eq!(passed, [true, false], "{report:?}");
 }
 
 #[test]
@@ -80,6 +87,18 @@ fn what_cannot_be_sent_is_in_the_report() {
     assert_eq!((report.frames_sent, report.frames_not_sent), (0, 1), "{report:?}");
     let report = run(&device, &[script("a", "fail(\"no\");")], None);
     assert_eq!(failure(&report), "line 1: no");
+}
+
+/// A device keeps periods from 47 us to 2^32 ticks; it must neither end the run over others, nor keep another one in their place.
+#[test]
+fn a_period_that_the_device_does_not_keep_comes_from_here() {
+    let device = device("load=0");
+    for (period, once) in [("1us", false), ("10d", true)] {
+        let source = format!("periodic(\"100#01\", \"{period}\"); wait(\"100ms\");");
+        let report = run(&device, &[script("a", &source)], Some(Duration::from_millis(300)));
+        assert!(report.is_success() && report.frames_repeated == 0, "{report:?}");
+        assert_eq!((report.frames_sent > 0, report.frames_sent == 1), (true, once), "{report:?}");
+    }
 }
 
 #[test]

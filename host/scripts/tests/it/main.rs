@@ -8,11 +8,16 @@ mod live;
 mod thread;
 mod twin;
 
+use std::alloc::System;
 use std::sync::Arc;
 
-use cantap_scripts::{Bench, Outcome, Report, Script};
+use cantap_scripts::{Bench, Counting, Outcome, Report, Script};
 use cantap_signals::{Decoder, Source};
 use cantap_trace::TraceRecord;
+
+/// As in every program that runs scripts.
+#[global_allocator]
+static ALLOCATOR: Counting<System> = Counting(System);
 
 const SECOND_NS: u64 = 1_000_000_000;
 

@@ -62,8 +62,20 @@ export function quantity(value: number, unit: string): string {
   return unit ? `${number} ${unit}` : number;
 }
 
+/** To a tenth; what is there, but less, is not shown as nothing. */
 export function percent(share: number | null): string {
-  return share === null ? '–' : `${(share * 100).toFixed(1)} %`;
+  if (share === null) return '–';
+  return share > 0 && share < 0.0005 ? '< 0.1 %' : `${(share * 100).toFixed(1)} %`;
+}
+
+/** In four characters where there is little room: `987`, `12.3k`, `1.23M`. */
+export function shortCount(value: number): string {
+  const unit = value >= 1e6 ? 1e6 : 1e3;
+  if (value < 1000) return String(value);
+  const digits = value / unit;
+  // Cut, not rounded: what is shown was reached.
+  const decimals = digits < 10 ? 2 : digits < 100 ? 1 : 0;
+  return `${(Math.floor(digits * 10 ** decimals) / 10 ** decimals).toFixed(decimals)}${unit === 1e6 ? 'M' : 'k'}`;
 }
 
 export function bytes(size: number): string {

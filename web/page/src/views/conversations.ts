@@ -26,12 +26,16 @@ const LADDER = [
   { name: 'What', class: 'c-what' },
 ];
 
-/** More events than this are left out, and said so. */
 /** Seconds that are read of a live trace. */
 const LIVE = 60;
+/** More events than this are left out, and said so. */
 const LIMIT = 100_000;
+/** Pixels of a rung, and with its text below it. */
+const RUNG = { wide: 26, narrow: 46 };
 /** Lanes of the ladder; who speaks less often shares the last one. */
 const LANES = 8;
+/** As in `narrow.css`. */
+const NARROW = '(max-width: 700px)';
 const LADDER_WIDTH = { wide: 480, narrow: 200 };
 
 export class ConversationsView implements View {
@@ -72,8 +76,9 @@ export class ConversationsView implements View {
       app.goto(event.time);
       this.lead('trace');
     };
+    const isNarrow = matchMedia(NARROW).matches;
     this.#list = new VirtualList('Conversations', COLUMNS, { length: () => this.#shown.length, fill: (row, cells, index) => this.#fill(row, cells, index), opened });
-    this.#ladder = new VirtualList('Conversations as a ladder', LADDER, { length: () => this.#shown.length, fill: (row, cells, index) => this.#rung(row, cells, index), opened }, 26);
+    this.#ladder = new VirtualList('Conversations as a ladder', LADDER, { length: () => this.#shown.length, fill: (row, cells, index) => this.#rung(row, cells, index), opened }, isNarrow ? RUNG.narrow : RUNG.wide);
     this.#search.addEventListener('input', () => this.#arrange());
     this.#shape = select(
       [
@@ -85,6 +90,7 @@ export class ConversationsView implements View {
       'Shape',
     );
     this.element = el('section', { class: 'view view-conversations', attrs: { 'aria-label': 'Conversations' } }, el('div', { class: 'bar' }, this.#search, this.#shape, this.#state), this.#lanes, this.#ladder.element, this.#list.element);
+    this.element.classList.toggle('two-lines', isNarrow);
     this.#shapeChanged();
     for (const topic of ['steady', 'messages'] as const) app.on(topic, () => this.#ask());
     commands.add(
@@ -124,7 +130,7 @@ export class ConversationsView implements View {
   }
 
   #arrange(): void {
-    this.#width = matchMedia('(max-width: 700px)').matches ? LADDER_WIDTH.narrow : LADDER_WIDTH.wide;
+    this.#width = matchMedia(NARROW).matches ? LADDER_WIDTH.narrow : LADDER_WIDTH.wide;
     this.element.style.setProperty('--ladder', `${this.#width}px`);
     const query = this.#search.value.trim();
     this.#shown = query === '' ? this.#events : this.#events.filter((e) => match(query, `${e.protocol} ${e.kind} ${e.from} ${e.to} ${e.text}`) !== null);
@@ -141,7 +147,7 @@ export class ConversationsView implements View {
       }),
     );
     const left = this.#total - this.#events.length;
-    setText(this.#state, `${count(this.#shown.length)} of ${count(this.#total)} events${left > 0 ? `; the last ${count(left)} are left out` : ''}`);
+    setText(this.#state, `${count(this.#shown.length)} of ${count(this.#total)} events${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}`);
     this.#list.refresh();
     this.#ladder.refresh();
   }

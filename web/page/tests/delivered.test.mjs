@@ -31,6 +31,7 @@ BU_: ECU
 BO_ 256 Engine: 8 ECU
  SG_ Speed : 0|16@1+ (0.25,0) [0|250] "km/h" ECU
  SG_ Mode : 16|2@1+ (1,0) [0|3] "" ECU
+ SG_ Total : 16|48@1+ (1,0) [0|0] "" ECU
 CM_ SG_ 256 Speed "</script><img src=x onerror=alert(1)>";
 VAL_ 256 Mode 0 "off" 1 "on" 2 "</b>hot" 3 "cold" ;
 `;
@@ -92,6 +93,17 @@ test('graphs: every value is in the columns, and texts are lanes', async () => {
   }
   await page.locator('#view-graphs .tree-signal', { hasText: 'Mode' }).click();
   await until(page, 'a lane', () => document.querySelectorAll('.panel.digital').length === 1);
+  await page.done();
+});
+
+test('a value of many digits is shown whole at a cursor', async () => {
+  const page = await opened('graphs');
+  await page.locator('#view-graphs .tree-signal', { hasText: 'Total' }).click();
+  await page.locator('#view-graphs .graph-stack').focus();
+  await page.keyboard.press(':');
+  await page.getByLabel('Time', { exact: true }).fill('0.041');
+  await page.keyboard.press('Enter');
+  await untilText(page, '#view-graphs .legend', 'A 67108864');
   await page.done();
 });
 

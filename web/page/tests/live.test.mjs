@@ -74,6 +74,11 @@ test('all views show what arrives', () =>
     await until(page, 'bits have been counted', () => /\d/.test(document.querySelector('#view-bits').textContent));
     await show(page, 'summary');
     await untilText(page, '#view-summary', 'Readlive');
+    await untilText(page, '#view-summary', 'Of a live trace they are looked for when you ask.');
+    assert.doesNotMatch(await page.locator('#view-summary').textContent(), /Nothing stood out/);
+    await page.locator('#find-findings').focus();
+    await page.keyboard.press('Enter');
+    await untilText(page, '#view-summary', 'Of the time up to');
     await untilText(page, '#view-summary', '500 kbit/s');
     await untilMore(page);
   }));
@@ -295,7 +300,7 @@ test('a device that goes away and comes back leaves a gap and a whole recording,
     await untilText(page, '#view-device', 'away');
     await untilText(page, '.notices', 'it continues when the device is back');
     board = await boardAt(socket);
-    await untilText(page, '#view-device', ': there');
+    await untilText(page, '#view-device', ': connected');
     await untilMore(page);
     await show(page, 'trace');
     await page.locator('#trace-filter').fill('lost');

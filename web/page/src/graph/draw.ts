@@ -256,6 +256,8 @@ export function drawTimeAxis(pen: Pen, width: number, height: number, range: Ran
     const at = Math.round(toPixel(x, tick)) + 0.5;
     pen.line([at, 0, at, 4], colours.axis, 1);
     const half = (tickText(tick, step).length * 6.5) / 2;
+    // A cursor's letter stands there.
+    if (cursors.some((cursor) => Math.abs(toPixel(x, cursor.time) - at) < half + 8)) continue;
     pen.text(tickText(tick, step), Math.min(Math.max(at, x.start + half), x.end - half), 12, { colour: colours.text, align: 'center', size: 11 });
   }
   pen.line([x.start, 0.5, x.end, 0.5], colours.axis, 1);

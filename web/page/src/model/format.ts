@@ -52,13 +52,13 @@ export function duration(value: number): string {
 export function significant(value: number, digits = 5): string {
   if (!Number.isFinite(value)) return String(value);
   const size = Math.abs(value);
-  if (size !== 0 && (size >= 1e9 || size < 1e-4)) return Number(value.toPrecision(digits)).toExponential().replace('-', '−');
+  if (size !== 0 && (size >= Math.max(1e9, 10 ** digits) || size < 1e-4)) return Number(value.toPrecision(digits)).toExponential().replace('-', '−');
   return String(Number(value.toPrecision(digits))).replace('-', '−');
 }
 
-/** A value of a signal, with its unit. */
-export function quantity(value: number, unit: string): string {
-  const number = significant(value, 7);
+/** A value of a signal, with its unit: whole, without the last digit that is only the arithmetic's. */
+export function quantity(value: number, unit: string, digits = 15): string {
+  const number = significant(value, digits);
   return unit ? `${number} ${unit}` : number;
 }
 

@@ -32,12 +32,16 @@ export class SummaryView implements View {
     const { app } = this;
     const { summary, report } = app;
     if (!summary) return;
+    // Live, it is drawn each second: whoever is at a button by the keyboard stays there.
+    const buttons = (): HTMLElement[] => [...this.element.querySelectorAll('button')];
+    const focused = buttons().indexOf(document.activeElement as HTMLElement);
     replace(
       this.element,
       el('h2', {}, report?.title ?? summary.name),
       report ? this.#reportFacts() : null,
       el('div', { class: 'columns' }, el('div', {}, section('Trace', facts(this.#traceFacts(summary))), section('Channels', this.#channels(summary)), section('Losses', this.#losses(summary))), el('div', {}, section(app.findings === null ? 'Findings' : `Findings (${count(app.findings.length)})`, this.#findings(summary)), section('Databases', this.#databases()))),
     );
+    if (focused >= 0) buttons()[focused]?.focus({ preventScroll: true });
   }
 
   #traceFacts(summary: Summary): [string, string][] {

@@ -49,7 +49,7 @@ const TRACES = {
   car: { path: join(root, 'docs/screens/drive.log.xz'), bitrate: '500k', database: join(root, 'host/virtual/src/car/car.dbc') },
   vehicle: { path: join(root, 'host/protocols/tests/buses/vehicle.log'), bitrate: '500k' },
   machine: { path: join(root, 'host/protocols/tests/buses/machine.log'), bitrate: '1M' },
-  boat: { path: join(root, 'host/protocols/tests/buses/boat.log'), bitrate: '250k', database: join(root, 'host/signals/tests/data/dbc/j1939.dbc') },
+  boat: { path: join(root, 'host/protocols/tests/buses/boat.log'), bitrate: '250k' },
   lossy: { text: lossy(), bitrate: '250k', text_database: LOSSY_DBC },
 };
 

@@ -4,7 +4,7 @@ import type { Gap, Series } from '../api';
 import type { Range } from '../model/app';
 import type { Style } from '../model/panels';
 import type { Pen } from './pen';
-import { type Scale, tickText, ticks, toPixel } from './scale';
+import { type Scale, tickText, tickTexts, ticks, toPixel } from './scale';
 import { columnAt } from './series-cache';
 
 export interface Colours {
@@ -155,10 +155,11 @@ function drawValueAxis(pen: Pen, sheet: Sheet, x: Scale, y: Scale, unit: string,
   const marks = ticks(y.from, y.to, Math.max(2, sheet.height / 34));
   const right = number === 0 ? MARGIN - 6 : x.end - 4 - (number - 1) * INNER_AXIS;
   const colour = number === 0 ? colours.text : own;
-  for (const tick of marks.values) {
+  const texts = tickTexts(marks);
+  for (const [i, tick] of marks.values.entries()) {
     const at = Math.round(toPixel(y, tick)) + 0.5;
     if (number === 0) pen.line([x.start, at, x.end, at], colours.grid, 1);
-    if (at > 18) pen.text(tickText(tick, marks.step), right, at, { colour, align: 'right', size: 10 });
+    if (at > 18) pen.text(texts[i] ?? '', right, at, { colour, align: 'right', size: 10 });
   }
   if (unit) pen.text(unit, right, 8, { colour, align: 'right', size: 10, maxWidth: INNER_AXIS });
 }

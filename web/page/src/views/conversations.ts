@@ -156,6 +156,7 @@ export class ConversationsView implements View {
     return ((i + 0.5) * this.#width) / Math.max(1, this.#parties.length);
   }
 
+  /** Where a party's lane is. Who is not known has none: what it says comes from the edge. */
   #lane(party: string): number {
     const at = this.#parties.indexOf(party);
     return at >= 0 ? at : this.#parties.length - 1;
@@ -180,14 +181,14 @@ export class ConversationsView implements View {
     const key = `${index} ${event.time} ${event.from} ${event.to} ${this.#parties.length}`;
     if (rung.dataset['key'] === key) return true;
     rung.dataset['key'] = key;
-    const from = this.#laneX(this.#lane(event.from));
+    const from = event.from === '' ? 1 : this.#laneX(this.#lane(event.from));
     const to = event.to ? this.#laneX(this.#lane(event.to)) : null;
     const lines = this.#parties.map((_, i) => svg('line', { x1: this.#laneX(i), x2: this.#laneX(i), y1: 0, y2: 26, class: 'lane' }));
     const arrow =
       to === null || to === from
         ? [svg('circle', { cx: from, cy: 13, r: 4, class: 'arrow' })]
-        : [svg('line', { x1: from, x2: to, y1: 13, y2: 13, class: 'arrow' }), svg('path', { d: `M${to} 13l${to > from ? -7 : 7} -4v8z`, class: 'arrow head' })];
-    rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from} to ${event.to}` : event.from }, ...lines, ...arrow));
+        : [svg('line', { x1: from, x2: to, y1: 13, y2: 13, class: event.from === '' ? 'arrow unknown' : 'arrow' }), svg('path', { d: `M${to} 13l${to > from ? -7 : 7} -4v8z`, class: 'arrow head' })];
+    rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from || 'unknown'} to ${event.to}` : event.from || 'unknown' }, ...lines, ...arrow));
     return true;
   }
 }

@@ -172,7 +172,7 @@ export class GraphsView implements View {
     const { panels } = this.app;
     const legend = panel.items.map((item) => ({ item, colour: el('span', { class: 'swatch' }), a: el('span', { class: 'mono' }), b: el('span', { class: 'mono' }), delta: el('span', { class: 'mono' }) }));
     const entries = legend.map(({ item, colour, a, b, delta }) => {
-      const entry = el('span', { class: 'legend', attrs: { draggable: 'true' } }, colour, el('span', {}, itemLabel(item)), el('span', { class: 'muted' }, itemUnit(item)), a, b, delta, button('×', () => panels.removeItem(panel, item), { class: 'icon', attrs: { 'aria-label': `Take ${itemLabel(item)} away` } }));
+      const entry = el('span', { class: 'legend', attrs: { draggable: 'true' } }, colour, el('span', { class: 'legend-name', title: itemLabel(item) }, itemLabel(item)), el('span', { class: 'muted legend-unit' }, itemUnit(item)), a, b, delta, button('×', () => panels.removeItem(panel, item), { class: 'icon', attrs: { 'aria-label': `Take ${itemLabel(item)} away` } }));
       entry.addEventListener('dragstart', (event) => {
         this.#carried = { panel, item };
         event.dataTransfer?.setData('text/plain', itemLabel(item));

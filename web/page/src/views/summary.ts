@@ -4,7 +4,7 @@ import type { Finding, Summary } from '../api';
 import type { App } from '../model/app';
 import { unpack } from '../model/report';
 import { saveBlob } from '../model/files';
-import { bitrate, count, duration, idText, missing, percent, seconds, utc } from '../model/format';
+import { bitrate, count, duration, idText, missing, percent, plural, seconds, utc } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { openDialog } from '../ui/dialog';
 import { button, el, field, replace } from '../ui/dom';
@@ -93,7 +93,7 @@ export class SummaryView implements View {
     return el(
       'ul',
       { class: 'plain' },
-      ...summary.losses.map((l) => el('li', { class: l.count > 0 || l.atLeast ? 'bad' : '' }, `${l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${missing(l.count, l.atLeast)}`)),
+      ...summary.losses.map((l) => el('li', { class: l.count > 0 || l.atLeast ? 'bad' : '' }, `${l.stage === 'unknown' ? 'at an unknown stage' : l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${missing(l.count, l.atLeast)}`)),
     );
   }
 
@@ -129,7 +129,7 @@ export class SummaryView implements View {
     const { databases, messages } = this.app;
     if (databases.length === 0) return el('p', {}, 'None. Drop a DBC, KCD, SYM, ARXML or DBF file anywhere on this page.');
     const seen = messages.filter((m) => m.count > 0).length;
-    return el('div', {}, el('ul', { class: 'plain' }, ...databases.map(({ name, channel }) => el('li', {}, channel === null ? name : `${name}, channel ${channel}`))), el('p', {}, `${count(messages.length)} messages, ${count(seen)} of them in this trace.`));
+    return el('div', {}, el('ul', { class: 'plain' }, ...databases.map(({ name, channel }) => el('li', {}, channel === null ? name : `${name}, channel ${channel}`))), el('p', {}, `${plural(messages.length, 'message')}, ${count(seen)} of them in this trace.`));
   }
 
   #reportFacts(): HTMLElement {

@@ -22,8 +22,11 @@ export async function start(wasm) {
     const text = new TextDecoder().decode(new Uint8Array(engine.memory.buffer, answer + 12, headLength));
     const sections = answer + 8 + aligned(4 + headLength);
     const { ok, error } = JSON.parse(text, (_key, value) => {
-      const place = value?.$u8;
-      return place ? new Uint8Array(engine.memory.buffer.slice(sections + place[0], sections + place[0] + place[1])) : value;
+      for (const [name, Type] of Object.entries({ $u8: Uint8Array, $u32: Uint32Array, $f64: Float64Array })) {
+        const place = value?.[name];
+        if (place) return new Type(engine.memory.buffer.slice(sections + place[0], sections + place[0] + place[1] * Type.BYTES_PER_ELEMENT));
+      }
+      return value;
     });
     engine.cantap_free(answer, size);
     if (error !== undefined) throw new Error(error);

@@ -329,7 +329,7 @@ export class Shell {
     this.#name.title = summary.name;
     const file = this.app.traceFile;
     const reading = summary.growing && summary.progress !== null;
-    setText(this.#status, `${count(summary.frames)} frames in ${duration(summary.duration)}${file ? `, ${bytes(file.size)} of ${summary.format}` : ''}${reading ? `, read ${percent(summary.progress)}` : ''}`);
+    setText(this.#status, `${count(summary.frames)} frames in ${duration(summary.duration)}${file ? `, ${summary.format}, ${bytes(file.size)}` : ''}${reading ? `, read ${percent(summary.progress)}` : ''}`);
     this.#progress.hidden = !reading;
     this.#progress.value = summary.progress ?? 0;
     const lost = summary.losses.reduce((sum, l) => sum + l.count, 0);
@@ -343,7 +343,7 @@ export class Shell {
 
   #drawChosen(): void {
     const chosen = this.app.identifier;
-    setText(this.#chosen, chosen ? `${chosen.channel}: ${idText(chosen.id, chosen.extended)}` : '');
+    setText(this.#chosen, chosen ? `chosen: ${idText(chosen.id, chosen.extended)} on channel ${chosen.channel}` : '');
   }
 
   #acceptFiles(): void {

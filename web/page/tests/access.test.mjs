@@ -59,3 +59,24 @@ test('axe finds nothing on the start screen, in the list of keys and in the pale
   assert.deepEqual(await violations(page), []);
   await page.done();
 });
+
+test('eight data bytes and what a loss says are in sight on a tablet, the bytes on a phone', async () => {
+  for (const size of [{ width: 1024, height: 768 }, { width: 390, height: 844 }]) {
+    const page = await opened('trace', { size });
+    await page.locator('#view-trace .list').press('End');
+    await until(page, 'the last row is the loss', () => document.querySelector('#view-trace .list-row.selected[data-kind=lost]') !== null);
+    const cut = await page.evaluate(() => {
+      const list = document.querySelector('#view-trace .list').getBoundingClientRect();
+      const right = (cell) => {
+        const range = document.createRange();
+        range.selectNodeContents(cell);
+        return Math.round(range.getBoundingClientRect().right - list.right);
+      };
+      const row = (kind) => [...document.querySelectorAll(`#view-trace .list-row[data-kind=${kind}]`)].find((r) => !r.hidden && (kind === 'lost' || r.querySelector('.c-data').textContent.length === 23));
+      return { data: right(row('data').querySelector('.c-data')), lost: right(row('lost').querySelector('.c-data')) };
+    });
+    assert.ok(cut.data <= 0, `${cut.data} pixels of the data are out of sight at ${size.width}`);
+    if (size.width > 700) assert.ok(cut.lost <= 0, `${cut.lost} pixels of the loss are out of sight`);
+    await page.done();
+  }
+});

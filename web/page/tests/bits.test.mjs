@@ -10,6 +10,14 @@ async function bits() {
   return page;
 }
 
+test('a bit that is always 1 is not shown as one that changed once', async () => {
+  const page = await opened('bits');
+  await page.locator('.bit').first().waitFor();
+  assert.equal(await page.locator('#bit-3').textContent(), '=1');
+  assert.match(await page.locator('#bit-7').textContent(), /^\d/);
+  await page.done();
+});
+
 test('the grid shows each bit’s changes, and signals have their outline, overlapping ones one within the other', async () => {
   const page = await bits();
   assert.equal(await page.locator('.bit').count(), 64);

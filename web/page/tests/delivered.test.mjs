@@ -1,8 +1,9 @@
 // The page as it is delivered, over its own engine: each view's figures against those of a trace that is computed here.
 
 import assert from 'node:assert/strict';
+import { join } from 'node:path';
 import { after, test } from 'node:test';
-import { newPage, quit, saved, show, until, untilRow, untilText } from './browser.mjs';
+import { HERE, newPage, quit, saved, show, until, untilRow, untilText } from './browser.mjs';
 
 after(quit);
 
@@ -31,6 +32,7 @@ BU_: ECU
 BO_ 256 Engine: 8 ECU
  SG_ Speed : 0|16@1+ (0.25,0) [0|250] "km/h" ECU
  SG_ Mode : 16|2@1+ (1,0) [0|3] "" ECU
+ SG_ Total : 16|48@1+ (1,0) [0|0] "" ECU
 CM_ SG_ 256 Speed "</script><img src=x onerror=alert(1)>";
 VAL_ 256 Mode 0 "off" 1 "on" 2 "</b>hot" 3 "cold" ;
 `;
@@ -95,9 +97,20 @@ test('graphs: every value is in the columns, and texts are lanes', async () => {
   await page.done();
 });
 
+test('a value of many digits is shown whole at a cursor', async () => {
+  const page = await opened('graphs');
+  await page.locator('#view-graphs .tree-signal', { hasText: 'Total' }).click();
+  await page.locator('#view-graphs .graph-stack').focus();
+  await page.keyboard.press(':');
+  await page.getByLabel('Time', { exact: true }).fill('0.041');
+  await page.keyboard.press('Enter');
+  await untilText(page, '#view-graphs .legend', 'A 67108864');
+  await page.done();
+});
+
 test('fixed view and periods give the identifier’s period', async () => {
   const page = await opened('fixed');
-  await untilText(page, '#view-fixed .list-layer', '100Engine4 00010 ms');
+  await untilText(page, '#view-fixed .list-layer', '100Engine4 00010.000');
   await page.locator('#view-fixed .list').focus();
   await page.keyboard.press('Home');
   await show(page, 'statistics');
@@ -131,6 +144,18 @@ test('conversations: a refused UDS request is marked as failed', async () => {
   await page.keyboard.press('/');
   await page.keyboard.type('refusal F190');
   await until(page, 'a failed exchange', () => document.querySelectorAll('#view-conversations .list:not([hidden]) .list-row.failed:not([hidden])').length >= 1);
+  await page.done();
+});
+
+test('conversations: who is not known is not drawn as somebody who is', async () => {
+  const page = await newPage({ file: PAGE });
+  await page.locator('main.start input[type=file]').setInputFiles([join(HERE, '../../../host/protocols/tests/buses/machine.log')]);
+  await page.locator('.shell[data-growing=false]').waitFor();
+  await show(page, 'conversations');
+  await until(page, 'what the master writes comes from the edge', () => {
+    const row = [...document.querySelectorAll('#view-conversations .list:not([hidden]) .list-row:not([hidden])')].find((r) => r.textContent.includes('SDO write 1017:00'));
+    return row.querySelector('svg').getAttribute('aria-label') === 'unknown to 5' && row.querySelector('line.arrow.unknown').getAttribute('x1') === '1';
+  });
   await page.done();
 });
 

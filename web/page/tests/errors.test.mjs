@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { after, test } from 'node:test';
-import { LOG, newPage, openTrace, opened, quit, until, untilText } from './browser.mjs';
+import { LOG, newPage, openTrace, opened, quit, saved, until, untilText } from './browser.mjs';
 
 after(quit);
 
@@ -47,6 +47,55 @@ test('when the engine dies, what is shown stays, and it is started again with th
   assert.ok((await page.locator('#view-trace .list-row:not([hidden])').count()) > 10);
   await page.getByRole('button', { name: 'Start it again' }).click();
   await until(page, 'the filter is answered', () => /records/.test(document.querySelector('#view-trace .state').textContent) && !document.querySelector('.engine-dead'));
+  await page.done();
+});
+
+test('an engine that is started again is given the databases and the bit rates anew', async () => {
+  const page = await opened('summary');
+  await page.locator('.shell > input[type=file]').setInputFiles([file('car.dbc', 'BU_:')]);
+  await untilText(page, '#view-summary', 'car.dbc');
+  await page.getByRole('button', { name: /^Bit rate of channel 1/ }).click();
+  await page.getByLabel('Bit rate', { exact: true }).fill('250k');
+  await page.keyboard.press('Enter');
+  await untilText(page, '#view-summary', '250 kbit/s');
+  await page.evaluate(() => globalThis.fakeEngines.at(-1).close());
+  await page.locator('#tab-trace').click();
+  await page.locator('#trace-filter').fill('123');
+  await page.getByRole('button', { name: 'Start it again' }).click();
+  await until(page, 'the engine is there', () => !document.querySelector('.engine-dead') && globalThis.fakeEngines.length === 2);
+  await page.locator('#tab-summary').click();
+  await untilText(page, '#view-summary', '250 kbit/s');
+  await until(page, 'the database is there', () => globalThis.fakeEngines.at(-1).asked.get('database') === 1);
+  await page.done();
+});
+
+test('a file that cannot be read takes no note and no cursor with it; one that is opened leaves the notes as texts', async () => {
+  const page = await opened('trace');
+  await page.locator('#view-trace .list').press('ArrowDown');
+  await page.keyboard.press('Control+b');
+  await page.getByLabel('Time', { exact: true }).fill('0.1');
+  await page.getByRole('textbox', { name: 'Note' }).fill('here');
+  await page.getByRole('button', { name: 'Add', exact: true }).click();
+  await page.locator('.shell > input[type=file]').setInputFiles([file('x.bin', 'garbage')]);
+  await untilText(page, '.notice.error', 'is no format');
+  await page.locator('#tab-notes').click();
+  await untilText(page, '#view-notes .notes', '0.100000 shere');
+  await page.locator('.shell > input[type=file]').setInputFiles([LOG]);
+  await untilText(page, '#view-notes .notes', 'drive.log, 0.100000 s: here');
+  await page.done();
+});
+
+test('a browser that closes the page asks while a note is in no file', async () => {
+  const page = await opened('trace');
+  const asks = () => page.evaluate(() => !dispatchEvent(new Event('beforeunload', { cancelable: true })));
+  assert.equal(await asks(), false);
+  await page.keyboard.press('Control+b');
+  await page.getByRole('textbox', { name: 'Note' }).fill('here');
+  await page.getByRole('button', { name: 'Add', exact: true }).click();
+  assert.equal(await asks(), true);
+  await page.locator('#tab-notes').click();
+  await saved(page, () => page.getByRole('button', { name: 'Save as text' }).click());
+  assert.equal(await asks(), false);
   await page.done();
 });
 

@@ -60,7 +60,7 @@ test('the trace grows and is followed; paused, it stands still while records sti
 
 test('all views show what arrives', () =>
   live(['-d', 'virtual:car'], 'fixed', async (page) => {
-    await until(page, 'identifiers have periods', () => [...document.querySelectorAll('#view-fixed .list-layer .list-row:not([hidden]) .c-period')].some((cell) => /ms/.test(cell.textContent)));
+    await until(page, 'identifiers have periods', () => [...document.querySelectorAll('#view-fixed .list-layer .list-row:not([hidden]) .c-period')].some((cell) => /\d\.\d{3}$/.test(cell.textContent)));
     const frames = () => page.locator('#view-fixed .list-layer .list-row:not([hidden]) .c-count').first().textContent();
     const before = await frames();
     await until(page, 'a count grows', (b) => document.querySelector('#view-fixed .list-layer .list-row:not([hidden]) .c-count').textContent !== b, before);
@@ -74,6 +74,11 @@ test('all views show what arrives', () =>
     await until(page, 'bits have been counted', () => /\d/.test(document.querySelector('#view-bits').textContent));
     await show(page, 'summary');
     await untilText(page, '#view-summary', 'Readlive');
+    await untilText(page, '#view-summary', 'Of a live trace they are looked for when you ask.');
+    assert.doesNotMatch(await page.locator('#view-summary').textContent(), /Nothing stood out/);
+    await page.locator('#find-findings').focus();
+    await page.keyboard.press('Enter');
+    await untilText(page, '#view-summary', 'Of the time up to');
     await untilText(page, '#view-summary', '500 kbit/s');
     await untilMore(page);
   }));
@@ -295,7 +300,7 @@ test('a device that goes away and comes back leaves a gap and a whole recording,
     await untilText(page, '#view-device', 'away');
     await untilText(page, '.notices', 'it continues when the device is back');
     board = await boardAt(socket);
-    await untilText(page, '#view-device', ': there');
+    await untilText(page, '#view-device', ': connected');
     await untilMore(page);
     await show(page, 'trace');
     await page.locator('#trace-filter').fill('lost');

@@ -4,7 +4,7 @@ import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { after, test } from 'node:test';
 import { gzipSync } from 'node:zlib';
-import { FAKE, newPage, quit, saved, untilText } from './browser.mjs';
+import { FAKE, newPage, quit, saved, until, untilText } from './browser.mjs';
 
 const folder = mkdtempSync(join(tmpdir(), 'cantap-page-'));
 after(async () => {
@@ -50,6 +50,15 @@ test('a report opens by itself: notes, findings, databases, and the trace comes 
   const file = await saved(page, () => page.getByRole('button', { name: 'Save the trace' }).click());
   assert.equal(file.name, 'drive.log');
   assert.ok(file.bytes.equals(trace));
+  await page.done();
+});
+
+test('a report’s title and findings are not shown above another trace', async () => {
+  const page = await newPage({ file: write('other.html', json(report())) });
+  await untilText(page, '#view-summary', 'From the report');
+  await page.locator('.shell > input[type=file]').setInputFiles([{ name: 'other.log', mimeType: 'text/plain', buffer: Buffer.from('(1.0) can0 123#22\n') }]);
+  await until(page, 'the report is gone', () => !/From the report|Drive|pedal/.test(document.querySelector('#view-summary').textContent));
+  assert.equal(await page.getByRole('button', { name: 'Save the trace' }).count(), 0);
   await page.done();
 });
 

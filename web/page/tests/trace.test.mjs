@@ -133,7 +133,7 @@ test('a time is gone to, and the selected identifier becomes the filter', async 
   await page.keyboard.type('1.5s');
   await page.keyboard.press('Enter');
   await untilRow(page, 1500);
-  await until(page, 'identifier 100 is chosen', () => document.querySelector('footer').textContent.includes('1: 100'));
+  await until(page, 'identifier 100 is chosen', () => document.querySelector('footer').textContent.includes('chosen: 100'));
   await focus(page);
   await page.keyboard.press('o');
   await untilText(page, '#view-trace .state', '5 000 of 20 000 records');

@@ -20,10 +20,19 @@ test('summary: a finding leads to its place; the bit rate is set in cantap’s s
   await page.done();
 });
 
+test('summary: whoever is at a button by the keyboard stays there when it is drawn anew', async () => {
+  const page = await opened('summary');
+  await page.getByRole('button', { name: /^Bit rate of channel 1/ }).focus();
+  await page.locator('.shell > input[type=file]').setInputFiles([{ name: 'car.dbc', mimeType: 'text/plain', buffer: Buffer.from('BU_:') }]);
+  await untilText(page, '#view-summary', 'car.dbc');
+  assert.match(await page.evaluate(() => document.activeElement.getAttribute('aria-label')), /^Bit rate of channel 1/);
+  await page.done();
+});
+
 test('fixed view: a row per identifier with its period, opened to its signals, and the bits that changed', async () => {
   const page = await opened('fixed');
   await until(page, 'four identifiers', () => document.querySelectorAll('#view-fixed .list-layer .list-row:not([hidden])').length === 4);
-  assert.match(await page.locator('#view-fixed .list-row[data-index="0"]').textContent(), /100Engine5 0004 ms/);
+  assert.match(await page.locator('#view-fixed .list-row[data-index="0"]').textContent(), /100Engine5 0004\.000/);
   assert.ok((await page.locator('#view-fixed .byte[data-changed]').count()) >= 4);
   await page.locator('#view-fixed .list').focus();
   await page.keyboard.press('Home');

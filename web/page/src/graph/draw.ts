@@ -4,7 +4,7 @@ import type { Gap, Series } from '../api';
 import type { Range } from '../model/app';
 import type { Style } from '../model/panels';
 import type { Pen } from './pen';
-import { type Scale, tickText, ticks, toPixel } from './scale';
+import { type Scale, tickText, tickTexts, ticks, toPixel } from './scale';
 import { columnAt } from './series-cache';
 
 export interface Colours {
@@ -155,10 +155,11 @@ function drawValueAxis(pen: Pen, sheet: Sheet, x: Scale, y: Scale, unit: string,
   const marks = ticks(y.from, y.to, Math.max(2, sheet.height / 34));
   const right = number === 0 ? MARGIN - 6 : x.end - 4 - (number - 1) * INNER_AXIS;
   const colour = number === 0 ? colours.text : own;
-  for (const tick of marks.values) {
+  const texts = tickTexts(marks);
+  for (const [i, tick] of marks.values.entries()) {
     const at = Math.round(toPixel(y, tick)) + 0.5;
     if (number === 0) pen.line([x.start, at, x.end, at], colours.grid, 1);
-    if (at > 18) pen.text(tickText(tick, marks.step), right, at, { colour, align: 'right', size: 10 });
+    if (at > 18) pen.text(texts[i] ?? '', right, at, { colour, align: 'right', size: 10 });
   }
   if (unit) pen.text(unit, right, 8, { colour, align: 'right', size: 10, maxWidth: INNER_AXIS });
 }
@@ -256,6 +257,8 @@ export function drawTimeAxis(pen: Pen, width: number, height: number, range: Ran
     const at = Math.round(toPixel(x, tick)) + 0.5;
     pen.line([at, 0, at, 4], colours.axis, 1);
     const half = (tickText(tick, step).length * 6.5) / 2;
+    // A cursor's letter stands there.
+    if (cursors.some((cursor) => Math.abs(toPixel(x, cursor.time) - at) < half + 8)) continue;
     pen.text(tickText(tick, step), Math.min(Math.max(at, x.start + half), x.end - half), 12, { colour: colours.text, align: 'center', size: 11 });
   }
   pen.line([x.start, 0.5, x.end, 0.5], colours.axis, 1);

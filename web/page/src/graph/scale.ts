@@ -21,9 +21,17 @@ export function ticks(from: number, to: number, most: number): Ticks {
 export function tickText(value: number, step: number): string {
   const decimals = Math.min(12, Math.max(0, -Math.floor(Math.log10(step) + 1e-9)));
   const size = Math.abs(value);
-  if (size >= 1e7 || (size > 0 && size < 1e-6)) return Number(value.toPrecision(4)).toExponential();
+  if (size >= 1e10 || (size > 0 && size < 1e-6)) return Number(value.toPrecision(4)).toExponential();
   const text = (size < step / 2 ? 0 : value).toFixed(decimals);
   return text.replace('-', '−');
+}
+
+/** The texts of an axis' ticks, no two alike: of numbers with too many digits for that, those behind the first say how much more they are. */
+export function tickTexts({ values, step }: Ticks): string[] {
+  const texts = values.map((value) => tickText(value, step));
+  const [first] = values;
+  if (first === undefined || new Set(texts).size === texts.length) return texts;
+  return texts.map((text, i) => (i === 0 ? `≈${text}` : `+${tickText(i * step, step)}`));
 }
 
 export interface Scale {

@@ -2,7 +2,7 @@
 
 import type { MessageInfo, SignalInfo } from '../api';
 import type { App } from '../model/app';
-import { count, idText } from '../model/format';
+import { count, idText, plural } from '../model/format';
 import type { Item } from '../model/panels';
 import { el, replace, setText } from '../ui/dom';
 import { match } from '../ui/palette';
@@ -64,7 +64,7 @@ export class SignalTree {
       if (open) rows.push(...signals.map((signal) => this.#signalRow(message, signal)));
     }
     replace(this.#list, ...rows);
-    setText(this.#state, messages.length === 0 ? 'No database: add one (DBC, KCD, SYM, ARXML) to see signals, or take bits in the view “Bits”.' : `${count(messages.length)} messages, ${count(shown)} signals`);
+    setText(this.#state, messages.length === 0 ? 'No database: add one (DBC, KCD, SYM, ARXML) to see signals, or take bits in the view “Bits”.' : `${plural(messages.length, 'message')}, ${plural(shown, 'signal')}`);
     const first = this.#list.querySelector<HTMLElement>('[role=treeitem]');
     if (first) first.tabIndex = 0;
     this.#marks();

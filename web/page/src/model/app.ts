@@ -7,7 +7,7 @@ import type { Connection } from '../live/connection';
 import type { Source } from '../live/source';
 import { Emitter } from './emitter';
 import { pieces } from './files';
-import { count } from './format';
+import { count, seconds } from './format';
 import { History } from './history';
 import { Panels } from './panels';
 import type { Report } from './report';
@@ -34,6 +34,16 @@ export interface Note {
   text: string;
 }
 
+/** What is made in the page itself. */
+export type Unsaved = 'notes' | 'signals';
+
+/** A database as it was given: an engine that is started again needs it again. */
+export interface Database {
+  name: string;
+  bytes: Uint8Array;
+  channel: number | null;
+}
+
 export type Notify = (level: 'info' | 'warning' | 'error', text: string, action?: { label: string; run: () => void }) => void;
 
 /** Seconds that the graphs show of a live trace until the user chooses. */
@@ -45,11 +55,14 @@ export class App extends Emitter<Topic> {
   summary: Summary | null = null;
   messages: MessageInfo[] = [];
   gaps: Gap[] = [];
-  findings: Finding[] = [];
+  /** Null: nobody has looked for them yet. */
+  findings: Finding[] | null = null;
+  /** Of a live trace: how long it was when they were looked for, in seconds. */
+  findingsUntil = 0;
   report: Report | null = null;
   /** The trace's file, for saving it again as it was. */
   traceFile: File | null = null;
-  databases: string[] = [];
+  databases: Database[] = [];
   identifier: Identifier | null = null;
   cursorA: number | null = null;
   cursorB: number | null = null;
@@ -82,6 +95,8 @@ export class App extends Emitter<Topic> {
   #refreshing = new Spacing(STEADY);
   #waitingSummary: Summary | null = null;
   #opening = 0;
+  /** Notes or signals were made here, and not saved. */
+  #unsaved = new Set<Unsaved>();
   #bitrates: Report['bitrates'] = [];
 
   constructor(
@@ -93,6 +108,23 @@ export class App extends Emitter<Topic> {
     this.profile = this.storage.load();
     this.panels = new Panels(() => this.panelsChanged());
     this.panels.restore(this.profile.panels);
+    addEventListener('beforeunload', (event) => {
+      if (this.#unsaved.size > 0) event.preventDefault();
+    });
+  }
+
+  /** What was made here and is in no file yet: a browser that closes the page asks first. */
+  get unsaved(): ReadonlySet<Unsaved> {
+    return this.#unsaved;
+  }
+
+  saved(what: Unsaved): void {
+    this.#unsaved.delete(what);
+  }
+
+  changed(what: Unsaved, isEmpty: boolean): void {
+    if (isEmpty) this.#unsaved.delete(what);
+    else this.#unsaved.add(what);
   }
 
   /** Asks the engine. Once it has died, every question is refused with the same words; what is shown stays. */
@@ -125,8 +157,11 @@ export class App extends Emitter<Topic> {
       this.engine = await this.restart();
       this.dead = null;
       this.emit('engine');
+      // The new engine has nothing of what the old one was given.
+      for (const { name, bytes, channel } of this.databases) await this.ask('database', { name, bytes, channel });
+      if (this.own.current !== '') await this.ask('setOwnDatabase', { dbc: this.own.current });
       if (this.live) this.live.again();
-      else if (this.traceFile) await this.openTrace(this.traceFile);
+      else if (this.traceFile) await this.openTrace(this.traceFile, this.#bitrates, true);
     } catch (error) {
       this.failed(error);
     }
@@ -138,13 +173,13 @@ export class App extends Emitter<Topic> {
     this.notify('error', error instanceof Error ? error.message : String(error));
   }
 
-  /** `bitrates`: what the file does not say itself, in bit/s. */
-  async openTrace(file: File, bitrates: Report['bitrates'] = []): Promise<void> {
+  /** `bitrates`: what the file does not say itself, in bit/s. `again`: the trace that is shown already, whose notes and cursors stay. */
+  async openTrace(file: File, bitrates: Report['bitrates'] = [], again = false): Promise<void> {
     const turn = ++this.#opening;
-    const before = this.summary ? { file: this.traceFile, bitrates: this.#bitrates } : null;
+    const before = this.summary ? { file: this.traceFile, bitrates: this.#bitrates, fitted: this.#fitted } : null;
     this.traceFile = file;
     this.#bitrates = bitrates;
-    this.#fitted = true;
+    if (!again) this.#fitted = true;
     let first = true;
     let read = 0;
     try {
@@ -154,7 +189,7 @@ export class App extends Emitter<Topic> {
           ? await this.ask('open', { name: file.name, bytes: piece.bytes, more: piece.more, size: file.size })
           : await this.ask('append', { bytes: piece.bytes, more: piece.more });
         if (turn !== this.#opening) return;
-        if (first) this.#forget();
+        if (first) this.#forget(again);
         first = false;
         read += piece.bytes.length;
         this.#take(summary);
@@ -163,7 +198,10 @@ export class App extends Emitter<Topic> {
       if (first) {
         // Nothing of the new file was taken in. The engine may have let go of the one before: it is read again.
         this.traceFile = null;
-        if (before?.file && this.dead === null) await this.openTrace(before.file, before.bitrates);
+        if (before?.file && this.dead === null) {
+          this.#fitted = before.fitted;
+          await this.openTrace(before.file, before.bitrates, true);
+        }
         throw error instanceof EngineStopped ? error : new Error(`${file.name}: ${error instanceof Error ? error.message : String(error)}`);
       }
       const reason = error instanceof Error ? error.message : String(error);
@@ -245,13 +283,19 @@ export class App extends Emitter<Topic> {
     if (this.summary) this.#take(this.summary);
   }
 
-  #forget(): void {
+  #forget(again = false): void {
     this.serial++;
+    this.findings = null;
+    this.gaps = [];
+    if (again) return;
     this.identifier = null;
     this.cursorA = this.cursorB = null;
-    this.findings = [];
-    this.gaps = [];
-    this.notes = this.notes.filter((note) => note.time === null);
+    if (!this.summary) return;
+    // What a report says is about its own trace; so are notes at a time, which stay as texts.
+    this.report = null;
+    const { name } = this.summary;
+    this.notes = this.notes.map((note) => (note.time === null ? note : { time: null, text: `${name}, ${seconds(note.time)} s: ${note.text}` }));
+    this.emit('notes');
   }
 
   #take(summary: Summary): void {
@@ -283,11 +327,24 @@ export class App extends Emitter<Topic> {
     this.messages = messages;
     this.gaps = gaps;
     this.findings = this.#joined(findings);
+    this.findingsUntil = summary.duration;
     this.panels.resolve(messages);
     this.#take(summary);
     this.emit('messages');
     this.emit('findings');
     this.emit('panels');
+  }
+
+  /** Looks for findings in what there is now. */
+  async lookForFindings(): Promise<void> {
+    try {
+      const until = this.summary?.duration ?? 0;
+      this.findings = this.#joined(await this.ask('findings', {}));
+      this.findingsUntil = until;
+      this.emit('findings');
+    } catch (error) {
+      this.failed(error);
+    }
   }
 
   #joined(findings: Finding[]): Finding[] {
@@ -300,7 +357,7 @@ export class App extends Emitter<Topic> {
 
   async addDatabase(name: string, bytes: Uint8Array, channel: number | null): Promise<void> {
     const answer = await this.ask('database', { name, bytes, channel });
-    this.databases.push(name);
+    this.databases.push({ name, bytes, channel });
     for (const warning of answer.warnings.slice(0, 5)) this.notify('warning', `${name}: ${warning}`);
     if (answer.warnings.length > 5) this.notify('warning', `${name}: ${count(answer.warnings.length - 5)} more warnings.`);
     await this.refresh();
@@ -312,6 +369,17 @@ export class App extends Emitter<Topic> {
     await this.ask('setOwnDatabase', { dbc });
     await this.refresh();
     this.emit('own');
+  }
+
+  /** The bit rate of a channel in bit/s, by the user. */
+  async setBitrate(channel: number, bitrate: number): Promise<void> {
+    try {
+      await this.ask('bitrate', { channel, bitrate });
+      this.#bitrates = [...this.#bitrates.filter((known) => known.channel !== channel), { channel, bitrate, dataBitrate: this.#bitrates.find((known) => known.channel === channel)?.dataBitrate ?? null }];
+      await this.refresh();
+    } catch (error) {
+      this.failed(error);
+    }
   }
 
   whole(): Range {
@@ -382,6 +450,13 @@ export class App extends Emitter<Topic> {
   addNote(note: Note): void {
     this.notes.push(note);
     this.notes.sort((a, b) => (a.time ?? -1) - (b.time ?? -1));
+    this.changed('notes', false);
+    this.emit('notes');
+  }
+
+  deleteNote(note: Note): void {
+    this.notes = this.notes.filter((n) => n !== note);
+    this.changed('notes', this.notes.length === 0);
     this.emit('notes');
   }
 

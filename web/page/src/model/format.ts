@@ -52,18 +52,30 @@ export function duration(value: number): string {
 export function significant(value: number, digits = 5): string {
   if (!Number.isFinite(value)) return String(value);
   const size = Math.abs(value);
-  if (size !== 0 && (size >= 1e9 || size < 1e-4)) return Number(value.toPrecision(digits)).toExponential().replace('-', '−');
+  if (size !== 0 && (size >= Math.max(1e9, 10 ** digits) || size < 1e-4)) return Number(value.toPrecision(digits)).toExponential().replace('-', '−');
   return String(Number(value.toPrecision(digits))).replace('-', '−');
 }
 
-/** A value of a signal, with its unit. */
-export function quantity(value: number, unit: string): string {
-  const number = significant(value, 7);
+/** A value of a signal, with its unit: whole, without the last digit that is only the arithmetic's. */
+export function quantity(value: number, unit: string, digits = 15): string {
+  const number = significant(value, digits);
   return unit ? `${number} ${unit}` : number;
 }
 
+/** To a tenth; what is there, but less, is not shown as nothing. */
 export function percent(share: number | null): string {
-  return share === null ? '–' : `${(share * 100).toFixed(1)} %`;
+  if (share === null) return '–';
+  return share > 0 && share < 0.0005 ? '< 0.1 %' : `${(share * 100).toFixed(1)} %`;
+}
+
+/** In four characters where there is little room: `987`, `12.3k`, `1.23M`. */
+export function shortCount(value: number): string {
+  const unit = value >= 1e6 ? 1e6 : 1e3;
+  if (value < 1000) return String(value);
+  const digits = value / unit;
+  // Cut, not rounded: what is shown was reached.
+  const decimals = digits < 10 ? 2 : digits < 100 ? 1 : 0;
+  return `${(Math.floor(digits * 10 ** decimals) / 10 ** decimals).toFixed(decimals)}${unit === 1e6 ? 'M' : 'k'}`;
 }
 
 export function bytes(size: number): string {

@@ -20,5 +20,7 @@ export function openDialog(title: string, body: Child[], actions: { label: strin
   });
   document.body.append(dialog);
   dialog.showModal();
+  // The focus goes to the first thing that takes it, which may stand at the end of a long text.
+  dialog.scrollTop = 0;
   return dialog;
 }

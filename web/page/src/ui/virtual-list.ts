@@ -12,6 +12,8 @@ export interface Column {
   name: string;
   /** CSS class of its cells; widths are in the style sheet. */
   class: string;
+  /** What its name leaves out. */
+  title?: string;
 }
 
 export interface RowSource {
@@ -53,7 +55,7 @@ export class VirtualList {
   ) {
     this.#spacer = el('div', { class: 'list-spacer' });
     this.#layer = el('div', { class: 'list-layer', attrs: { role: 'rowgroup' } });
-    const head = el('div', { class: 'list-head', attrs: { role: 'rowgroup' } }, el('div', { class: 'list-row', attrs: { role: 'row', 'aria-rowindex': 1 } }, ...columns.map((c) => el('div', { class: `cell ${c.class}`, attrs: { role: 'columnheader' } }, c.name))));
+    const head = el('div', { class: 'list-head', attrs: { role: 'rowgroup' } }, el('div', { class: 'list-row', attrs: { role: 'row', 'aria-rowindex': 1 } }, ...columns.map((c) => el('div', { class: `cell ${c.class}`, title: c.title ?? '', attrs: { role: 'columnheader' } }, c.name))));
     this.element = el('div', { class: 'list', attrs: { role, tabindex: 0, 'aria-label': label, 'aria-colcount': columns.length } }, head, this.#spacer, this.#layer);
     this.element.addEventListener('scroll', () => this.#scrolled(), { passive: true });
     // After a finger has moved by rows, the bar is put where these rows are.

@@ -3,7 +3,7 @@
 import type { BitGrid, SignalInfo } from '../api';
 import type { App } from '../model/app';
 import { bitOfCell, borders, cellsOf, fieldBetween } from '../model/bit-layout';
-import { bytesText, count, duration, percent } from '../model/format';
+import { bytesText, duration, percent, plural, shortCount } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { button, el, replace, select, setText } from '../ui/dom';
 import { SignalEditor } from './signal-editor';
@@ -103,14 +103,15 @@ export class BitsView implements View {
   #draw(): void {
     const bits = this.#bits;
     if (!bits) return;
-    const period = this.#chosen.picker.row?.period;
-    setText(this.#state, `${count(bits.frames)} frames${period ? `, one every ${duration(period.median)}` : ''}`);
+    // The period is that of the newest frames, and not of a stretch.
+    const period = this.#window === 'all' ? this.#chosen.picker.row?.period : null;
+    setText(this.#state, `${plural(bits.frames, 'frame')}${period ? `, lately one every ${duration(period.median)}` : ''}`);
     const cells = bits.length * 8;
     this.#anchor = Math.min(this.#anchor, Math.max(0, cells - 1));
     this.#at = Math.min(this.#at, Math.max(0, cells - 1));
     const places = bits.signals.map((signal) => new Set(cellsOf(signal)));
     const last = bytesText(this.#chosen.picker.row?.lastData ?? '').split(' ');
-    const rows: HTMLElement[] = [el('div', { class: 'bit-row head', attrs: { role: 'row' } }, el('span', { attrs: { role: 'columnheader' } }, 'Byte'), ...[7, 6, 5, 4, 3, 2, 1, 0].map((b) => el('span', { attrs: { role: 'columnheader' } }, String(b))), el('span', { attrs: { role: 'columnheader' } }, 'last'))];
+    const rows: HTMLElement[] = [el('div', { class: 'bit-row head', attrs: { role: 'row' } }, el('span', { attrs: { role: 'columnheader' } }, 'Byte'), ...[7, 6, 5, 4, 3, 2, 1, 0].map((b) => el('span', { attrs: { role: 'columnheader' } }, String(b))), el('span', { title: 'The newest data of the trace', attrs: { role: 'columnheader' } }, 'last'))];
     for (let byte = 0; byte < bits.length; byte++) {
       const row = el('div', { class: 'bit-row', attrs: { role: 'row' } }, el('span', { class: 'mono', attrs: { role: 'rowheader' } }, String(byte)));
       for (let column = 0; column < 8; column++) row.append(this.#cell(bits, byte * 8 + column, places));
@@ -128,7 +129,8 @@ export class BitsView implements View {
     const share = bits.frames > 1 ? flips / (bits.frames - 1) : 0;
     // Rare changes must be seen, too: the square root lifts them.
     const heat = flips === 0 ? 0 : Math.max(1, Math.ceil(Math.sqrt(share) * 9));
-    const shown = flips === 0 ? (ones > 0 ? '1' : '0') : shortCount(flips);
+    // A bit that is always 1 is not one that changed once.
+    const shown = flips === 0 ? (ones > 0 ? '=1' : '=0') : shortCount(flips);
     const element = el('span', { class: `bit heat${heat}`, id: `bit-${cell}`, attrs: { role: 'gridcell', 'aria-label': `${shown}, byte ${cell >> 3} bit ${bitOfCell(cell) & 7}: ${flips} changes, 1 in ${ones} of ${bits.frames} frames` } }, shown);
     element.dataset['cell'] = String(cell);
     let depth = 0;
@@ -164,7 +166,7 @@ export class BitsView implements View {
     const at = this.#at;
     const flips = bits.flips[at] ?? 0;
     const names = bits.signals.filter((s) => cellsOf(s).includes(at)).map((s) => s.name);
-    setText(this.#about, `byte ${at >> 3} bit ${bitOfCell(at) & 7}: ${count(flips)} changes, 1 in ${percent(bits.frames ? (bits.ones[at] ?? 0) / bits.frames : null)}${names.length > 0 ? `, in ${names.join(', ')}` : ''} · marked: start ${field.startBit}, ${field.bitLength} bit, ${field.littleEndian ? 'little' : 'big'}-endian`);
+    setText(this.#about, `byte ${at >> 3} bit ${bitOfCell(at) & 7}: ${flips === 0 ? 'never changed' : plural(flips, 'change')}, set in ${percent(bits.frames ? (bits.ones[at] ?? 0) / bits.frames : null)} of the frames${names.length > 0 ? `, in ${names.join(', ')}` : ''} · marked: start ${field.startBit}, ${field.bitLength} bit, ${field.littleEndian ? 'little' : 'big'}-endian`);
     this.#editor.markedChanged();
   }
 
@@ -206,8 +208,4 @@ export class BitsView implements View {
     this.#at = cell;
     this.#mark();
   }
-}
-
-function shortCount(value: number): string {
-  return value < 1000 ? String(value) : value < 1e6 ? `${Math.floor(value / 1000)}k` : `${Math.floor(value / 1e6)}M`;
 }

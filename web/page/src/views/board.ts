@@ -30,7 +30,7 @@ export class BoardView implements View {
     this.#again = button('Go on in this trace …', () => void openBoard(app, { again: true }), { id: 'board-again' });
     this.#new = button('Another trace …', () => void openBoard(app), { id: 'board-new' });
     this.#rates = button('Bit rates …', () => void openBoard(app, { again: true, same: true }), { id: 'board-rates' });
-    const head = ['Channel', 'Bit rate', 'Mode', 'State', 'Errors sent / received', 'Frames received', 'Lost', 'Counted by the board'];
+    const head = ['Channel', 'Bit rate', 'Mode', 'State', 'Error counters, send / receive', 'Frames received', 'Lost', 'Counted by the board'];
     this.element = el(
       'section',
       { class: 'view view-device', attrs: { 'aria-label': 'Board' } },

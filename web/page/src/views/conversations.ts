@@ -26,12 +26,16 @@ const LADDER = [
   { name: 'What', class: 'c-what' },
 ];
 
-/** More events than this are left out, and said so. */
 /** Seconds that are read of a live trace. */
 const LIVE = 60;
+/** More events than this are left out, and said so. */
 const LIMIT = 100_000;
+/** Pixels of a rung, and with its text below it. */
+const RUNG = { wide: 26, narrow: 46 };
 /** Lanes of the ladder; who speaks less often shares the last one. */
 const LANES = 8;
+/** As in `narrow.css`. */
+const NARROW = '(max-width: 700px)';
 const LADDER_WIDTH = { wide: 480, narrow: 200 };
 
 export class ConversationsView implements View {
@@ -72,8 +76,9 @@ export class ConversationsView implements View {
       app.goto(event.time);
       this.lead('trace');
     };
+    const isNarrow = matchMedia(NARROW).matches;
     this.#list = new VirtualList('Conversations', COLUMNS, { length: () => this.#shown.length, fill: (row, cells, index) => this.#fill(row, cells, index), opened });
-    this.#ladder = new VirtualList('Conversations as a ladder', LADDER, { length: () => this.#shown.length, fill: (row, cells, index) => this.#rung(row, cells, index), opened }, 26);
+    this.#ladder = new VirtualList('Conversations as a ladder', LADDER, { length: () => this.#shown.length, fill: (row, cells, index) => this.#rung(row, cells, index), opened }, isNarrow ? RUNG.narrow : RUNG.wide);
     this.#search.addEventListener('input', () => this.#arrange());
     this.#shape = select(
       [
@@ -85,6 +90,7 @@ export class ConversationsView implements View {
       'Shape',
     );
     this.element = el('section', { class: 'view view-conversations', attrs: { 'aria-label': 'Conversations' } }, el('div', { class: 'bar' }, this.#search, this.#shape, this.#state), this.#lanes, this.#ladder.element, this.#list.element);
+    this.element.classList.toggle('two-lines', isNarrow);
     this.#shapeChanged();
     for (const topic of ['steady', 'messages'] as const) app.on(topic, () => this.#ask());
     commands.add(
@@ -124,7 +130,7 @@ export class ConversationsView implements View {
   }
 
   #arrange(): void {
-    this.#width = matchMedia('(max-width: 700px)').matches ? LADDER_WIDTH.narrow : LADDER_WIDTH.wide;
+    this.#width = matchMedia(NARROW).matches ? LADDER_WIDTH.narrow : LADDER_WIDTH.wide;
     this.element.style.setProperty('--ladder', `${this.#width}px`);
     const query = this.#search.value.trim();
     this.#shown = query === '' ? this.#events : this.#events.filter((e) => match(query, `${e.protocol} ${e.kind} ${e.from} ${e.to} ${e.text}`) !== null);
@@ -141,7 +147,7 @@ export class ConversationsView implements View {
       }),
     );
     const left = this.#total - this.#events.length;
-    setText(this.#state, `${count(this.#shown.length)} of ${count(this.#total)} events${left > 0 ? `; the last ${count(left)} are left out` : ''}`);
+    setText(this.#state, `${count(this.#shown.length)} of ${count(this.#total)} events${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}`);
     this.#list.refresh();
     this.#ladder.refresh();
   }
@@ -150,6 +156,7 @@ export class ConversationsView implements View {
     return ((i + 0.5) * this.#width) / Math.max(1, this.#parties.length);
   }
 
+  /** Where a party's lane is. Who is not known has none: what it says comes from the edge. */
   #lane(party: string): number {
     const at = this.#parties.indexOf(party);
     return at >= 0 ? at : this.#parties.length - 1;
@@ -174,14 +181,14 @@ export class ConversationsView implements View {
     const key = `${index} ${event.time} ${event.from} ${event.to} ${this.#parties.length}`;
     if (rung.dataset['key'] === key) return true;
     rung.dataset['key'] = key;
-    const from = this.#laneX(this.#lane(event.from));
+    const from = event.from === '' ? 1 : this.#laneX(this.#lane(event.from));
     const to = event.to ? this.#laneX(this.#lane(event.to)) : null;
     const lines = this.#parties.map((_, i) => svg('line', { x1: this.#laneX(i), x2: this.#laneX(i), y1: 0, y2: 26, class: 'lane' }));
     const arrow =
       to === null || to === from
         ? [svg('circle', { cx: from, cy: 13, r: 4, class: 'arrow' })]
-        : [svg('line', { x1: from, x2: to, y1: 13, y2: 13, class: 'arrow' }), svg('path', { d: `M${to} 13l${to > from ? -7 : 7} -4v8z`, class: 'arrow head' })];
-    rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from} to ${event.to}` : event.from }, ...lines, ...arrow));
+        : [svg('line', { x1: from, x2: to, y1: 13, y2: 13, class: event.from === '' ? 'arrow unknown' : 'arrow' }), svg('path', { d: `M${to} 13l${to > from ? -7 : 7} -4v8z`, class: 'arrow head' })];
+    rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from || 'unknown'} to ${event.to}` : event.from || 'unknown' }, ...lines, ...arrow));
     return true;
   }
 }

@@ -55,7 +55,7 @@ export class DeviceView implements View {
       el('div', { class: 'row' }, button('Save …', exportAll, { id: 'live-save' })),
     );
     this.#filtering = section('Filters of the device', el('div', { class: 'row' }, field('Receive only', this.#filters, 'Several separated by blanks; empty for everything. What they keep back is neither shown nor recorded.'), button('Apply', () => this.#applyFilters())));
-    const head = ['Channel', 'Bit rate', 'State', 'Errors sent / received'];
+    const head = ['Channel', 'Bit rate', 'State', 'Error counters, send / receive'];
     this.element = el(
       'section',
       { class: 'view view-device', attrs: { 'aria-label': 'Device' } },
@@ -154,7 +154,7 @@ export class DeviceView implements View {
     const key = JSON.stringify([state.devices, state.channels, state.isNormal, state.maySend, state.mayConfigure, state.filters, state.ended]);
     if (key === this.#drawn) return;
     this.#drawn = key;
-    replace(this.#devices, state.ended ? el('li', { class: 'bad' }, state.ended) : null, ...state.devices.map((d) => el('li', { class: d.isThere ? '' : 'bad' }, `${d.name}: ${d.isThere ? 'there' : `away (${d.reason ?? 'unknown'})`}`)));
+    replace(this.#devices, state.ended ? el('li', { class: 'bad' }, state.ended) : null, ...state.devices.map((d) => el('li', { class: d.isThere ? '' : 'bad' }, `${d.name}: ${d.isThere ? 'connected' : `gone (${d.reason ?? 'unknown'})`}`)));
     replace(
       this.#channels,
       ...state.channels.map((c) =>
@@ -173,7 +173,7 @@ export class DeviceView implements View {
   #drawRecording({ recording }: State): void {
     setText(this.#record, recording ? 'Stop recording' : 'Record');
     for (const input of [this.#name, this.#around, this.#before, this.#after]) input.disabled = recording !== null;
-    setText(this.#recording, recording ? recordingText(recording) : `Everything that arrives is recorded by ${this.live.command}, whatever this page shows.`);
+    setText(this.#recording, recording ? recordingText(recording) : `Nothing is recorded now. A recording has everything that arrives, whatever this page shows, and goes on when it is closed.`);
   }
 }
 

@@ -2,7 +2,7 @@
 
 import type { IdRow } from '../api';
 import { type App, type Identifier, sameIdentifier } from '../model/app';
-import { bytesText, count, duration, idText, seconds } from '../model/format';
+import { bytesText, count, idText, seconds } from '../model/format';
 import { Latest } from '../model/latest';
 import { Spacing } from '../model/spacing';
 import type { Commands } from '../ui/commands';
@@ -17,7 +17,7 @@ const COLUMNS = [
   { name: 'ID', class: 'c-id' },
   { name: 'Message', class: 'c-message' },
   { name: 'Frames', class: 'c-count' },
-  { name: 'Period', class: 'c-period' },
+  { name: 'Period / ms', class: 'c-period', title: 'The median of the newest 512 frames; beside it, their smallest and largest' },
   { name: 'smallest', class: 'c-period' },
   { name: 'largest', class: 'c-period' },
   { name: 'Last / s', class: 'c-time' },
@@ -181,7 +181,7 @@ export class FixedView implements View {
     }
     const { row: id } = line;
     const open = this.#open.has(keyOf(id));
-    const texts = [id.signals.length > 0 ? (open ? '▾' : '▸') : '', String(id.channel), idText(id.id, id.extended), id.message ?? '', count(id.count), id.period ? duration(id.period.median) : '–', id.period ? duration(id.period.min) : '–', id.period ? duration(id.period.max) : '–', seconds(id.lastTime)];
+    const texts = [id.signals.length > 0 ? (open ? '▾' : '▸') : '', String(id.channel), idText(id.id, id.extended), id.message ?? '', count(id.count), ...[id.period?.median, id.period?.min, id.period?.max].map(milliseconds), seconds(id.lastTime)];
     for (const [i, text] of texts.entries()) setText(cells[i] as HTMLElement, text);
     row.setAttribute('aria-level', '1');
     if (id.signals.length > 0) row.setAttribute('aria-expanded', String(open));
@@ -208,6 +208,11 @@ export class FixedView implements View {
     element.dataset['changed'] = String(strengths.filter((s) => s > 0).length);
     return element;
   }
+}
+
+/** With microseconds: what stands one below the other can be compared. */
+function milliseconds(value: number | undefined): string {
+  return value === undefined ? '–' : (value * 1e3).toFixed(3);
 }
 
 function newest(changed: Float64Array): number {

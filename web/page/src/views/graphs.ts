@@ -172,7 +172,7 @@ export class GraphsView implements View {
     const { panels } = this.app;
     const legend = panel.items.map((item) => ({ item, colour: el('span', { class: 'swatch' }), a: el('span', { class: 'mono' }), b: el('span', { class: 'mono' }), delta: el('span', { class: 'mono' }) }));
     const entries = legend.map(({ item, colour, a, b, delta }) => {
-      const entry = el('span', { class: 'legend', attrs: { draggable: 'true' } }, colour, el('span', {}, itemLabel(item)), el('span', { class: 'muted' }, itemUnit(item)), a, b, delta, button('×', () => panels.removeItem(panel, item), { class: 'icon', attrs: { 'aria-label': `Take ${itemLabel(item)} away` } }));
+      const entry = el('span', { class: 'legend', attrs: { draggable: 'true' } }, colour, el('span', { class: 'legend-name', title: itemLabel(item) }, itemLabel(item)), el('span', { class: 'muted legend-unit' }, itemUnit(item)), a, b, delta, button('×', () => panels.removeItem(panel, item), { class: 'icon', attrs: { 'aria-label': `Take ${itemLabel(item)} away` } }));
       entry.addEventListener('dragstart', (event) => {
         this.#carried = { panel, item };
         event.dataTransfer?.setData('text/plain', itemLabel(item));
@@ -319,7 +319,7 @@ export class GraphsView implements View {
         setText(entry.a, failure ?? 'no database has it');
         continue;
       }
-      const write = (value: number): string => trace.texts.find((t) => t.value === value)?.text ?? quantity(value, trace.unit);
+      const write = (value: number): string => trace.texts.find((t) => t.value === value)?.text ?? quantity(value, trace.unit, entry.item.kind === 'load' ? 4 : undefined);
       const at = (cursor: 'A' | 'B', time: number | null): number | null => {
         if (time === null || !trace.series) return null;
         const exact = this.#exact.get(entry.item, cursor, time);
@@ -329,9 +329,9 @@ export class GraphsView implements View {
       const a = at('A', cursorA);
       const b = at('B', cursorB);
       const hover = cursorA === null && this.#hover !== null && trace.series ? valueAt(trace.series, this.#hover) : null;
-      setText(entry.a, a !== null ? `A ${write(a)}` : hover ? (hover.min === hover.max ? write(hover.min) : `${quantity(hover.min, '')} … ${quantity(hover.max, trace.unit)}`) : '');
+      setText(entry.a, a !== null ? `A ${write(a)}` : hover ? (hover.min === hover.max ? write(hover.min) : `${quantity(hover.min, '', 7)} … ${quantity(hover.max, trace.unit, 7)}`) : '');
       setText(entry.b, b !== null ? `B ${write(b)}` : '');
-      setText(entry.delta, a !== null && b !== null ? `Δy ${quantity(b - a, trace.unit)}` : '');
+      setText(entry.delta, a !== null && b !== null ? `Δy ${quantity(b - a, trace.unit, entry.item.kind === 'load' ? 4 : 12)}` : '');
     }
   }
 
@@ -341,7 +341,7 @@ export class GraphsView implements View {
     if (this.#hover !== null) parts.push(`at ${seconds(this.#hover)} s`);
     if (cursorA !== null) parts.push(`A ${seconds(cursorA)} s`);
     if (cursorB !== null) parts.push(`B ${seconds(cursorB)} s`);
-    if (cursorA !== null && cursorB !== null && cursorA !== cursorB) parts.push(`Δt ${duration(cursorB - cursorA)} (${quantity(1 / Math.abs(cursorB - cursorA), 'Hz')})`);
+    if (cursorA !== null && cursorB !== null && cursorA !== cursorB) parts.push(`Δt ${duration(cursorB - cursorA)} (${quantity(1 / Math.abs(cursorB - cursorA), 'Hz', 7)})`);
     setText(this.#state, parts.join('   '));
   }
 

@@ -73,14 +73,12 @@ export class NotesView implements View {
             this.lead('trace');
           }, { class: 'link mono' }),
       el('span', { class: 'note-text' }, note.text),
-      button('×', () => {
-        this.app.notes = this.app.notes.filter((n) => n !== note);
-        this.app.emit('notes');
-      }, { class: 'icon', attrs: { 'aria-label': `Delete the note “${note.text}”` } }),
+      button('×', () => this.app.deleteNote(note), { class: 'icon', attrs: { 'aria-label': `Delete the note “${note.text}”` } }),
     );
   }
 
   #save(): void {
+    this.app.saved('notes');
     save('notes.txt', this.app.notes.map((n) => `${n.time === null ? '-' : seconds(n.time)}\t${n.text.replaceAll('\n', ' ')}\n`).join(''), 'text/plain');
   }
 }

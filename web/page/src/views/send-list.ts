@@ -18,7 +18,9 @@ export class SendList {
   readonly #start: HTMLButtonElement;
   readonly #running = el('tbody');
   readonly #list = el('tbody', { id: 'send-list' });
-  readonly #none = el('p', { class: 'muted' }, 'Nothing is in the list. It is kept with the layout, and as a file it is the same as that of the live view (cantap monitor, page Send).');
+  readonly #runningTable: HTMLElement;
+  readonly #listTable: HTMLElement;
+  readonly #none = el('p', { class: 'muted' }, 'Nothing is in the send list. It is kept with the layout, and as a file it is the same as that of the live view (cantap monitor, page Send).');
   readonly #hint = el('p', { class: 'muted' });
   #can = false;
   #drawn = '';
@@ -32,14 +34,16 @@ export class SendList {
     this.#frame.addEventListener('keydown', (event) => event.key === 'Enter' && this.#sendOnce());
     const head = ['Channel', 'Frame', 'Period', ''];
     const heads = (names: string[]): HTMLElement => el('thead', {}, el('tr', {}, ...names.map((h) => el('th', { attrs: { scope: 'col' } }, h))));
+    this.#runningTable = el('table', { class: 'numbers' }, el('caption', {}, 'Sent by the device until it is stopped, or no page is open any more'), heads(head), this.#running);
+    this.#listTable = el('table', { class: 'numbers' }, el('caption', {}, 'Send list'), heads(['Entry', '']), this.#list);
     this.element = el(
       'div',
       {},
       el('div', { class: 'row' }, field('Channel', this.#channel), field('Frame', this.#frame), this.#once),
       el('div', { class: 'row' }, field('Period / ms', this.#period), field('Changes', this.#changes, 'counter BYTE.LOWBIT:BITS, random BYTE, checksum BYTE:xor|sum|crc8'), this.#start),
       this.#hint,
-      el('table', { class: 'numbers' }, el('caption', {}, 'Sent by the device until it is stopped, or no page is open any more'), heads(head), this.#running),
-      el('table', { class: 'numbers' }, el('caption', {}, 'Send list'), heads(['Entry', '']), this.#list),
+      this.#runningTable,
+      this.#listTable,
       this.#none,
       el('div', { class: 'row' }, button('Add once', () => this.#add(false), { title: 'Puts channel and frame from above into the list' }), button('Add periodic', () => this.#add(true), { title: 'Puts channel, frame, period and changes from above into the list' }), button('Save the list …', () => save('send-list.txt', this.#text()), { id: 'send-save' }), button('Add a file …', () => this.#choose(), { id: 'send-load' })),
     );
@@ -109,6 +113,7 @@ export class SendList {
   #drawList(): void {
     const { sendList } = this.app.profile;
     this.#none.hidden = sendList.length > 0;
+    this.#listTable.hidden = sendList.length === 0;
     const row = (line: string, at: number): HTMLElement => {
       const entry = parseEntry(line);
       const run = button(entry.periodMs === null ? 'Send' : 'Start', () => this.#send(entry), { attrs: { 'aria-label': `${entry.periodMs === null ? 'Send' : 'Start'} ${line}` } });
@@ -132,6 +137,7 @@ export class SendList {
     this.#drawList();
     this.#hint.textContent = can ? '' : state.maySend ? 'The channels only listen: let them take part first.' : `This server only listens: start ${this.live.command} with ${state.sendOption}.`;
     this.#hint.hidden = can;
+    this.#runningTable.hidden = state.periodic.length === 0;
     replace(
       this.#running,
       ...state.periodic.map((entry) =>

@@ -186,6 +186,7 @@ export class SignalEditor {
     try {
       const { dbc } = await this.app.ask('editSignal', edit);
       this.app.own.push(dbc);
+      this.app.changed('signals', false);
       await this.app.refresh();
       this.app.emit('own');
       this.#addToGraphs(edit);
@@ -220,6 +221,7 @@ export class SignalEditor {
     }
     try {
       await this.app.setOwn(dbc);
+      this.app.changed('signals', dbc === '');
     } catch (error) {
       this.app.failed(error);
     }
@@ -227,7 +229,10 @@ export class SignalEditor {
 
   save(): void {
     if (this.app.own.current === '') this.app.notify('info', 'No signal was made here yet.');
-    else save('own.dbc', this.app.own.current);
+    else {
+      this.app.saved('signals');
+      save('own.dbc', this.app.own.current);
+    }
   }
 }
 

@@ -4,7 +4,7 @@ import type { Finding, Summary } from '../api';
 import type { App } from '../model/app';
 import { unpack } from '../model/report';
 import { saveBlob } from '../model/files';
-import { bitrate, count, duration, idText, missing, percent, seconds, utc } from '../model/format';
+import { bitrate, count, duration, idText, missing, percent, plural, seconds, utc } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { openDialog } from '../ui/dialog';
 import { button, el, field, replace } from '../ui/dom';
@@ -32,12 +32,16 @@ export class SummaryView implements View {
     const { app } = this;
     const { summary, report } = app;
     if (!summary) return;
+    // Live, it is drawn each second: whoever is at a button by the keyboard stays there.
+    const buttons = (): HTMLElement[] => [...this.element.querySelectorAll('button')];
+    const focused = buttons().indexOf(document.activeElement as HTMLElement);
     replace(
       this.element,
       el('h2', {}, report?.title ?? summary.name),
       report ? this.#reportFacts() : null,
-      el('div', { class: 'columns' }, el('div', {}, section('Trace', facts(this.#traceFacts(summary))), section('Channels', this.#channels(summary)), section('Losses', this.#losses(summary))), el('div', {}, section(`Findings (${count(app.findings.length)})`, this.#findings()), section('Databases', this.#databases()))),
+      el('div', { class: 'columns' }, el('div', {}, section('Trace', facts(this.#traceFacts(summary))), section('Channels', this.#channels(summary)), section('Losses', this.#losses(summary))), el('div', {}, section(app.findings === null ? 'Findings' : `Findings (${count(app.findings.length)})`, this.#findings(summary)), section('Databases', this.#databases()))),
     );
+    if (focused >= 0) buttons()[focused]?.focus({ preventScroll: true });
   }
 
   #traceFacts(summary: Summary): [string, string][] {
@@ -55,7 +59,7 @@ export class SummaryView implements View {
   }
 
   #channels(summary: Summary): HTMLElement {
-    const head = ['Channel', 'Frames', 'Sent', 'Remote', 'Errors', 'Bit rate', 'Load'];
+    const head = ['Channel', 'Frames', 'Load', 'Bit rate', 'Errors', 'Sent', 'Remote'];
     return el(
       'div',
       { class: 'scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Channels' } },
@@ -72,11 +76,11 @@ export class SummaryView implements View {
               {},
               el('th', { attrs: { scope: 'row' } }, String(c.channel)),
               el('td', {}, count(c.frames)),
+              el('td', {}, percent(c.load)),
+              el('td', {}, button(bitrate(c.bitrate), () => this.#askBitrate(c.channel), { class: 'link', title: 'Set the bit rate', attrs: { 'aria-label': `Bit rate of channel ${c.channel}: ${bitrate(c.bitrate)}, change` } })),
+              el('td', { class: c.errors > 0 ? 'bad' : '' }, count(c.errors)),
               el('td', {}, count(c.sent)),
               el('td', {}, count(c.remote)),
-              el('td', { class: c.errors > 0 ? 'bad' : '' }, count(c.errors)),
-              el('td', {}, button(bitrate(c.bitrate), () => this.#askBitrate(c.channel), { class: 'link', title: 'Set the bit rate', attrs: { 'aria-label': `Bit rate of channel ${c.channel}: ${bitrate(c.bitrate)}, change` } })),
-              el('td', {}, percent(c.load)),
             ),
           ),
         ),
@@ -89,14 +93,23 @@ export class SummaryView implements View {
     return el(
       'ul',
       { class: 'plain' },
-      ...summary.losses.map((l) => el('li', { class: l.count > 0 || l.atLeast ? 'bad' : '' }, `${l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${missing(l.count, l.atLeast)}`)),
+      ...summary.losses.map((l) => el('li', { class: l.count > 0 || l.atLeast ? 'bad' : '' }, `${l.stage === 'unknown' ? 'at an unknown stage' : l.stage}${l.channel === null ? '' : `, channel ${l.channel}`}: ${missing(l.count, l.atLeast)}`)),
     );
   }
 
-  #findings(): HTMLElement {
-    const { findings } = this.app;
-    if (findings.length === 0) return el('p', {}, 'Nothing stood out.');
-    return el('ol', { class: 'findings' }, ...findings.map((finding) => el('li', { class: finding.severity }, this.#finding(finding))));
+  /** Nothing found and nothing looked for are two things. */
+  #findings(summary: Summary): HTMLElement {
+    const { app } = this;
+    const { findings } = app;
+    const isLive = summary.growing && summary.progress === null;
+    const look = (label: string): HTMLElement => button(label, () => void app.lookForFindings(), { id: 'find-findings' });
+    if (findings === null) return isLive ? el('div', {}, el('p', {}, 'Of a live trace they are looked for when you ask.'), look('Look for findings')) : el('p', {}, 'They are looked for when the whole file was read.');
+    return el(
+      'div',
+      {},
+      findings.length === 0 ? el('p', {}, 'Nothing stood out.') : el('ol', { class: 'findings' }, ...findings.map((finding) => el('li', { class: finding.severity }, this.#finding(finding)))),
+      isLive ? el('p', { class: 'muted' }, `Of the time up to ${seconds(app.findingsUntil)} s. `, look('Look again')) : null,
+    );
   }
 
   #finding(finding: Finding): HTMLElement {
@@ -116,7 +129,7 @@ export class SummaryView implements View {
     const { databases, messages } = this.app;
     if (databases.length === 0) return el('p', {}, 'None. Drop a DBC, KCD, SYM, ARXML or DBF file anywhere on this page.');
     const seen = messages.filter((m) => m.count > 0).length;
-    return el('div', {}, el('ul', { class: 'plain' }, ...databases.map((name) => el('li', {}, name))), el('p', {}, `${count(messages.length)} messages, ${count(seen)} of them in this trace.`));
+    return el('div', {}, el('ul', { class: 'plain' }, ...databases.map(({ name, channel }) => el('li', {}, channel === null ? name : `${name}, channel ${channel}`))), el('p', {}, `${plural(messages.length, 'message')}, ${count(seen)} of them in this trace.`));
   }
 
   #reportFacts(): HTMLElement {
@@ -155,10 +168,7 @@ export class SummaryView implements View {
             problem.textContent = `“${input.value}” is no bit rate: write for example 500k.`;
             return false;
           }
-          void this.app
-            .ask('bitrate', { channel, bitrate: value })
-            .then(() => this.app.refresh())
-            .catch((error: unknown) => this.app.failed(error));
+          void this.app.setBitrate(channel, value);
           return true;
         },
       },

@@ -19,7 +19,7 @@ libfuzzer_sys::fuzz_target!(|text: &str| {
     if let Ok(mut condition) = Condition::new(text, &decoder) {
         let Ok(frame) = frame.or_else(|_| "001#0102030405060708".parse()) else { return };
         let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-        condition.holds(&TraceRecord { time_ns: 0, channel: 1, event });
+        condition.holds(&TraceRecord { time_ns: 0, device_ns: None, channel: 1, event });
     }
     let _ = text.parse::<NamedFilter>().map(|named| named.resolve(&decoder));
     let _ = text.parse::<NamedId>().map(|named| named.resolve(&decoder));

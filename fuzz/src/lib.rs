@@ -12,7 +12,7 @@ pub fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
         Some(frame) => TraceEvent::Frame { frame, direction: Direction::Rx, late: false },
         None => TraceEvent::GAP,
     };
-    TraceRecord { time_ns, channel: 1, event }
+    TraceRecord { time_ns, device_ns: None, channel: 1, event }
 }
 
 /// Any identifier: odd numbers are extended ones.

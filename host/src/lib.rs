@@ -23,7 +23,7 @@ pub mod transmit;
 pub mod unsent;
 
 pub use cantap_trace::{
-    Channel, Direction, FdBits, FdFrame, Frame, FrameBits, Id, TraceEvent, TraceFrame, TraceRecord,
+    Channel, DeviceNs, Direction, FdBits, FdFrame, Frame, FrameBits, Id, TraceEvent, TraceFrame, TraceRecord,
     bits_on_bus,
 };
 pub use cantap_wire as wire;

@@ -198,7 +198,7 @@ impl Listener {
         let known = self.ended_at.unwrap_or(self.heard_at).0;
         let gap: Vec<_> = self.channels().map(|(channel, _)| channel.number()).collect();
         for channel in gap {
-            self.keep(TraceRecord { time_ns: known, channel, event: TraceEvent::GAP });
+            self.keep(TraceRecord { time_ns: known, device_ns: None, channel, event: TraceEvent::GAP });
         }
         self.error = Some(if was_stopping {
             DeviceError::BadEnd { address: self.name.clone(), reason: error.to_string() }

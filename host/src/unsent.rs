@@ -352,7 +352,7 @@ mod tests {
     fn seen(events: &[TraceEvent], ends: &[TransmitFailure]) -> Seen {
         let mut seen = Seen::default();
         for (at, event) in (0..).zip(events) {
-            seen.push(&TraceRecord { time_ns: at * 1_000_000, channel: 1, event: *event });
+            seen.push(&TraceRecord { time_ns: at * 1_000_000, device_ns: None, channel: 1, event: *event });
         }
         for reason in ends {
             let result = Err(*reason);
@@ -397,7 +397,7 @@ mod tests {
         let length_ns = i64::from(crate::bits_on_bus(&text.parse().unwrap())) * 2_000;
         let mut full = Seen::default();
         for at in 0..1000 {
-            full.push(&TraceRecord { time_ns: at * length_ns, channel: 1, event: others });
+            full.push(&TraceRecord { time_ns: at * length_ns, device_ns: None, channel: 1, event: others });
         }
         assert_eq!(cause(full, true), Cause::BusFull { load_pct: Some(100.0) });
     }

@@ -303,6 +303,9 @@ class Record:
     def time_ns(self) -> int:
         """Nanoseconds since 1970, UTC. For a frame it is the end."""
     @property
+    def device_ns(self) -> int | None:
+        """The same moment by the device's own clock, in nanoseconds, corrected by nothing; `None` where it is not known."""
+    @property
     def channel(self) -> int:
         """The channel, from 1."""
     @property

@@ -2,7 +2,7 @@
 
 use cantap_columns::FrameColumns;
 use cantap_trace::{
-    BusErrorKind, Direction, FdFrame, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame,
+    BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame,
     TraceRecord, TransmitFailure,
 };
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
@@ -220,6 +220,12 @@ impl Record {
     #[getter]
     fn time_ns(&self) -> i64 {
         self.0.time_ns
+    }
+
+    /// The same moment by the device's own clock, in nanoseconds, corrected by nothing; `None` where it is not known.
+    #[getter]
+    fn device_ns(&self) -> Option<u64> {
+        self.0.device_ns.map(DeviceNs::get)
     }
 
     /// The channel, from 1.

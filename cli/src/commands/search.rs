@@ -247,6 +247,9 @@ impl Sink {
                 let mut object = serde_json::json!({
                     "time_s": record.time_ns as f64 / 1e9, "channel": record.channel, "match": found.is_some(),
                 });
+                if let Some(device_ns) = record.device_ns {
+                    object["device_ns"] = device_ns.get().into();
+                }
                 match record.frame() {
                     Some(frame) => {
                         object["id"] = frame.id().to_string().into();

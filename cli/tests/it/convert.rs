@@ -195,9 +195,9 @@ fn standard_input_and_output_are_logs_unless_told() {
     assert_eq!(
         out.lines().take(3).collect::<Vec<_>>(),
         [
-            "time,channel,direction,type,id,dlc,data,event",
-            "1410714882.000000,1,Rx,data,123,2,1122,",
-            "1410714883.000000,2,Tx,data,1F334455,1,AA,",
+            "time,channel,direction,type,id,dlc,data,event,device_ns",
+            "1410714882.000000,1,Rx,data,123,2,1122,,",
+            "1410714883.000000,2,Tx,data,1F334455,1,AA,,",
         ]
     );
 }

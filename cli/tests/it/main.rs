@@ -25,6 +25,7 @@ mod db;
 mod decode;
 mod defaults;
 mod device_care;
+mod device_time;
 mod diagnostics;
 mod disturb;
 mod doctor;

@@ -12,6 +12,7 @@ use arrow_array::types::{
     ArrowPrimitiveType, DurationMicrosecondType, DurationMillisecondType, DurationNanosecondType,
     DurationSecondType, Float32Type, Float64Type, Int64Type, TimestampMicrosecondType,
     TimestampMillisecondType, TimestampNanosecondType, TimestampSecondType, UInt8Type, UInt32Type,
+    UInt64Type,
 };
 use arrow_array::{
     Array, ArrayRef, BinaryArray, BooleanArray, PrimitiveArray, RecordBatch, StringArray, UInt8Array,
@@ -93,6 +94,7 @@ fn converted(column: &ArrayRef, name: &str, ours: &DataType) -> Result<ArrayRef,
         DataType::Boolean => (FLAG, flags(array)),
         DataType::UInt8 => (WHOLE, whole::<UInt8Type>(array)),
         DataType::UInt32 => (WHOLE, whole::<UInt32Type>(array)),
+        DataType::UInt64 => (WHOLE, whole::<UInt64Type>(array)),
         DataType::Binary => (DATA, data(array)),
         _ => (TEXT, Ok(texts(array))),
     };

@@ -2,11 +2,13 @@
 
 use std::sync::{Arc, LazyLock};
 
-use arrow_array::builder::{ArrayBuilder as _, BinaryBuilder, BooleanBuilder, UInt8Builder, UInt32Builder};
+use arrow_array::builder::{
+    ArrayBuilder as _, BinaryBuilder, BooleanBuilder, UInt8Builder, UInt32Builder, UInt64Builder,
+};
 use arrow_array::types::Int8Type;
 use arrow_array::{ArrayRef, RecordBatch};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
-use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, FdFrame, TraceEvent, TraceRecord};
 
 use crate::events::{self, Events};
 use crate::texts::Texts;
@@ -34,6 +36,7 @@ pub const TX: &str = "tx";
 /// | `direction` | text: `rx`, `tx` | frames |
 /// | `dlc` | uint8: the code on the bus, 0 to 15 | frames |
 /// | `data` | binary, 0 to 64 bytes | frames |
+/// | `device_ns` | uint64: nanoseconds of the device's own clock, corrected by nothing | records that have it |
 pub struct FrameColumns {
     events: Events,
     id: UInt32Builder,
@@ -42,6 +45,7 @@ pub struct FrameColumns {
     direction: Texts<Int8Type>,
     dlc: UInt8Builder,
     data: BinaryBuilder,
+    device_ns: UInt64Builder,
 }
 
 const FLAGS: [&str; 6] = ["extended", "remote", "fd", "late", "brs", "esi"];
@@ -53,6 +57,7 @@ static SCHEMA: LazyLock<SchemaRef> = LazyLock::new(|| {
     fields.push(Field::new("direction", Texts::<Int8Type>::data_type(), true));
     fields.push(Field::new("dlc", DataType::UInt8, true));
     fields.push(Field::new("data", DataType::Binary, true));
+    fields.push(Field::new("device_ns", DataType::UInt64, true));
     Arc::new(Schema::new(fields))
 });
 
@@ -65,6 +70,7 @@ impl Default for FrameColumns {
             direction: Texts::new([RX, TX]),
             dlc: UInt8Builder::new(),
             data: BinaryBuilder::new(),
+            device_ns: UInt64Builder::new(),
         }
     }
 }
@@ -78,6 +84,7 @@ impl FrameColumns {
     /// Appends a row.
     pub fn push(&mut self, record: &TraceRecord) {
         self.events.push(record);
+        self.device_ns.append_option(record.device_ns.map(DeviceNs::get));
         let mut flags = [None; FLAGS.len()];
         if let TraceEvent::Frame { frame, direction, late } = &record.event {
             let (id, fd) = (frame.id(), frame.fd());
@@ -109,7 +116,8 @@ impl FrameColumns {
         columns.push(Arc::new(self.id.finish()));
         columns.extend(self.flags.iter_mut().map(|flag| Arc::new(flag.finish()) as ArrayRef));
         columns.push(self.direction.take());
-        let rest: [ArrayRef; 2] = [Arc::new(self.dlc.finish()), Arc::new(self.data.finish())];
+        let rest: [ArrayRef; 3] =
+            [Arc::new(self.dlc.finish()), Arc::new(self.data.finish()), Arc::new(self.device_ns.finish())];
         columns.extend(rest);
         RecordBatch::try_new(Self::schema(), columns).expect("columns are as the schema says")
     }

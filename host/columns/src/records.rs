@@ -3,12 +3,13 @@
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
     ArrowPrimitiveType, Int8Type, Int16Type, Int32Type, TimestampNanosecondType, UInt8Type, UInt32Type,
+    UInt64Type,
 };
 use arrow_array::{Array, BinaryArray, BooleanArray, PrimitiveArray, RecordBatch, StringArray};
 use arrow_schema::DataType;
 use cantap_trace::{
-    BusErrorKind, Direction, ErrorState, FdFrame, Frame, Id, LossStage, TraceEvent, TraceFrame, TraceRecord,
-    TransmitFailure,
+    BusErrorKind, DeviceNs, Direction, ErrorState, FdFrame, Frame, Id, LossStage, TraceEvent, TraceFrame,
+    TraceRecord, TransmitFailure,
 };
 
 use crate::bad::BadColumns;
@@ -31,6 +32,7 @@ use crate::signals::VALUE;
 /// | `remote`, `brs`, `esi`, `late`, `at_least` | false |
 /// | `direction` | `rx` |
 /// | `dlc` | what belongs to the length of `data`; 0 for a remote frame |
+/// | `device_ns` | not known; so is 0 |
 ///
 /// Numbers may have any width, and be floating-point if they are whole. `time` may be a timestamp of any unit, a duration, or float64
 /// seconds; without a zone it is UTC. `data` may be binary, a list of numbers, or text with pairs of hexadecimal digits. `id` may be
@@ -65,6 +67,7 @@ struct Columns<'a> {
     direction: Text<'a>,
     dlc: &'a PrimitiveArray<UInt8Type>,
     data: &'a BinaryArray,
+    device_ns: &'a PrimitiveArray<UInt64Type>,
 }
 
 /// A column of texts, in any representation.
@@ -149,6 +152,7 @@ impl<'a> Columns<'a> {
             direction: text("direction")?,
             dlc: typed(batch, "dlc", "uint8", u8)?,
             data: typed(batch, "data", "binary", |array| array.as_binary_opt())?,
+            device_ns: typed(batch, "device_ns", "uint64", |array| array.as_primitive_opt())?,
         })
     }
 
@@ -197,7 +201,9 @@ impl<'a> Columns<'a> {
             VALUE => return Err("it is a decoded value; records are what `read` gives without a database"),
             _ => return Err("its event is not of a known kind"),
         };
-        Ok(TraceRecord { time_ns: self.time.value(row), channel: self.channel.value(row), event })
+        let device_ns =
+            self.device_ns.is_valid(row).then(|| self.device_ns.value(row)).and_then(DeviceNs::new);
+        Ok(TraceRecord { time_ns: self.time.value(row), device_ns, channel: self.channel.value(row), event })
     }
 
     fn counters(&self, row: usize) -> Option<(u8, u8)> {

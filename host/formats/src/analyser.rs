@@ -97,7 +97,7 @@ mod tests {
                 },
                 _ => continue,
             };
-            kept.push(TraceRecord { time_ns, channel: 1, event });
+            kept.push(TraceRecord { time_ns, device_ns: None, channel: 1, event });
         }
         kept
     }
@@ -130,7 +130,7 @@ mod tests {
                 let frame = frame.into();
                 TraceEvent::Frame { frame, direction: Direction::Rx, late: false }
             };
-            let record = |(at, frame)| TraceRecord { time_ns: at as i64, channel: 1, event: event(frame) };
+            let record = |(at, frame)| TraceRecord { time_ns: at as i64, device_ns: None, channel: 1, event: event(frame) };
             let records: Vec<_> = frames.into_iter().enumerate().map(record).collect();
             prop_assert_eq!(tests::round_trip(CSV, &records), records.clone());
             prop_assert_eq!(tests::round_trip(Format::Dif, &records), records);
@@ -142,7 +142,7 @@ mod tests {
     fn rows_are_the_analysers() {
         let frame = "000#55".parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-        let record = TraceRecord { time_ns: 97_125, channel: 1, event };
+        let record = TraceRecord { time_ns: 97_125, device_ns: None, channel: 1, event };
         let row = "1;0,000097125;D;S;0;1;55;;;;;;;;;;;;Y;Y;N;55;3";
         let csv = tests::write(CSV, &[record]);
         let lines: Vec<_> = csv.split("\r\n").collect();

@@ -51,6 +51,7 @@ impl RowFormat for Decoder {
             let event = TraceEvent::Lost { stage: None, count, at_least: false };
             return Ok(Line::Record(TraceRecord {
                 time_ns: self.last_ns,
+                device_ns: None,
                 channel: self.last_channel.max(1),
                 event,
             }));
@@ -70,7 +71,7 @@ impl RowFormat for Decoder {
         let words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let data = Payload::exactly(words, fields.data_len(), hex_byte)?;
         (self.last_ns, self.last_channel) = (time_ns, channel);
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 
     fn may_be_cut(&self, _line: &[u8], record: &TraceRecord) -> bool {

@@ -83,7 +83,7 @@ impl RowFormat for Decoder {
         } else {
             Payload::exactly(words, fields.data_len(), byte)?
         };
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 
     fn may_be_cut(&self, _line: &[u8], record: &TraceRecord) -> bool {

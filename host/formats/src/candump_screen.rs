@@ -186,7 +186,7 @@ impl Decoder {
         let (raw, is_extended) = number(id).ok_or_else(missing)?;
         let (len, is_fd) = length(len).ok_or_else(missing)?;
         let channel = self.interfaces.channel(interface);
-        let record = |event| TraceRecord { time_ns, channel, event };
+        let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
         let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         if is_extended && raw & ERROR_FLAG != 0 {
             let data = Payload::words(words, usize::from(len.min(8)), hex_byte)?;

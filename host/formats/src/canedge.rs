@@ -106,7 +106,7 @@ impl RowFormat for Decoder {
         if fd.is_none() && fields.data_len() != data.as_slice().len() {
             return Err(Fault::malformed("up to 8 data bytes", bytes));
         }
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 
     fn may_be_cut(&self, _line: &[u8], record: &TraceRecord) -> bool {

@@ -51,7 +51,7 @@ impl RowFormat for Decoder {
         let data = Payload::exactly(words, fields.data_len(), hex_byte)?;
         let event = fields.event(&data)?;
         let time_ns = self.minutes_ns.saturating_add(shown_ns);
-        Ok(Line::Record(TraceRecord { time_ns, channel: 1, event }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel: 1, event }))
     }
 
     fn note(&mut self) -> Option<&'static str> {

@@ -86,7 +86,7 @@ impl Decoder {
             b"T" => Direction::Tx,
             other => return Err(Fault::malformed("'R' or 'T' after the time", other)),
         };
-        let record = |event| TraceRecord { time_ns, channel, event };
+        let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
         if flags.eq_ignore_ascii_case(b"ErrorFrame") || flags.eq_ignore_ascii_case(b"XErrorFrame") {
             return Ok(record(TraceEvent::BusError { kind: None, counters: None }));
         }

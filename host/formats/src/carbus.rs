@@ -53,7 +53,7 @@ impl RowFormat for Decoder {
         let fields = FrameFields { id, remote: false, direction: Direction::Rx, len, fd: None };
         let words = bytes.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let data = Payload::exactly(words, fields.data_len(), hex_byte)?;
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 
     fn missing(&self) -> Option<&'static str> {

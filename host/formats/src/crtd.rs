@@ -62,7 +62,7 @@ impl RowFormat for Decoder {
         }
         let data = Payload::words(words(), len, hex_byte)?;
         let fields = FrameFields { id, remote: false, direction, len: len as u8, fd: None };
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 }
 

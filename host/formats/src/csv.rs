@@ -44,6 +44,8 @@ pub enum CsvDialect {
 #[derive(Default)]
 pub(crate) struct Decoder {
     dialect: Option<CsvDialect>,
+    /// Whether our own dialect's rows end with the device's time.
+    has_device: bool,
     analyser: analyser::RowDecoder,
     gvret: gvret::RowDecoder,
     /// Lines before the header that may be the analyser's comments, with the fault to report if they are not.
@@ -67,12 +69,12 @@ impl Decode for Decoder {
         let dialect = self.dialect.map(|dialect| DIALECTS.iter().position(|known| *known == dialect));
         self.no_head.is_empty()
             && self.error_frames.is_over()
-            && seek::save(&(dialect, self.analyser.state(), &self.gvret), state)
+            && seek::save(&(dialect, self.has_device, self.analyser.state(), &self.gvret), state)
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
         let (dialect, analyser): (Option<Option<usize>>, _);
-        (dialect, analyser, self.gvret) = seek::load(state)?;
+        (dialect, self.has_device, analyser, self.gvret) = seek::load(state)?;
         self.dialect = match dialect {
             Some(number) => Some(*DIALECTS.get(number?)?),
             None => None,
@@ -98,7 +100,7 @@ impl Decode for Decoder {
             let result = match self.dialect {
                 None => self.head(text),
                 Some(CsvDialect::PythonCan) => python_can::row(text, &mut self.error_frames),
-                Some(CsvDialect::Full) => full::row(text).map(|record| Some((record, None))),
+                Some(CsvDialect::Full) => full::row(text, self.has_device).map(|record| Some((record, None))),
                 Some(CsvDialect::Analyser) => self.analyser.line(text, line.terminated),
                 Some(CsvDialect::Gvret) => self.gvret.line(text),
             };
@@ -145,6 +147,7 @@ impl Decoder {
         let Ok(Some((TraceRecord { event, .. }, _))) = read else { return false };
         let is_frame = matches!(event, TraceEvent::Frame { .. });
         match self.dialect {
+            Some(CsvDialect::Full) if self.has_device => !row.ends_with(b","),
             Some(CsvDialect::Full) => !is_frame || !(row.ends_with(b",") || row.ends_with(b",late")),
             Some(CsvDialect::PythonCan) => !is_frame && !row.ends_with(b"="),
             // Its rows end with a comma.
@@ -156,8 +159,9 @@ impl Decoder {
     fn head(&mut self, line: &[u8]) -> Result<Row, Fault> {
         if line == python_can::HEAD.as_bytes() {
             self.dialect = Some(CsvDialect::PythonCan);
-        } else if line == full::HEAD.as_bytes() {
+        } else if [full::HEAD, full::HEAD_WITHOUT_DEVICE].map(str::as_bytes).contains(&line) {
             self.dialect = Some(CsvDialect::Full);
+            self.has_device = line == full::HEAD.as_bytes();
         } else if self.gvret.head(line) {
             self.dialect = Some(CsvDialect::Gvret);
         } else if self.analyser.head(line) {
@@ -188,7 +192,7 @@ mod tests {
     use super::*;
     use crate::{Format, WriteOptions};
     use cantap_trace::Direction;
-    use cantap_trace::testing::{record, record_or_fd};
+    use cantap_trace::testing::{record, record_or_fd, with_device_time};
     use proptest::prelude::*;
 
     proptest! {
@@ -219,8 +223,33 @@ mod tests {
         }
 
         #[test]
-        fn our_own_dialect_keeps_fd_frames(records in prop::collection::vec(record_or_fd(1), 0..20)) {
+        fn our_own_dialect_keeps_fd_frames_and_the_devices_time(
+            records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..20),
+        ) {
             prop_assert_eq!(tests::round_trip(Format::Csv(CsvDialect::Full), &records), records);
+        }
+    }
+
+    #[test]
+    fn a_file_of_before_there_was_the_devices_time_is_read_and_half_a_time_is_none() {
+        let old = "time,channel,direction,type,id,dlc,data,event\n1.5,1,Rx,data,123,1,55,late\n1.5,1,Rx,data,123,1,55,";
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::Full), old);
+        assert_eq!((records.len(), issues), (2, Vec::new()));
+        assert_eq!(records[0].device_ns, None);
+        let head = "time,channel,direction,type,id,dlc,data,event,device_ns\n";
+        let row = "1.5,1,Rx,data,123,1,55,,1234567";
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::Full), format!("{head}{row}\n"));
+        assert_eq!((records[0].device_ns, issues), (cantap_trace::DeviceNs::new(1_234_567), Vec::new()));
+        for cut in [row, &row[..row.len() - 2], "1.5,1,Rx,data,123,1,55,", "1.5,1,Rx,data,123,1,55,late"] {
+            let (records, issues) = tests::read(Format::Csv(CsvDialect::Full), format!("{head}{cut}"));
+            assert_eq!((records.len(), issues.len()), (0, 1), "{cut}: {issues:?}");
+        }
+        for wrong in ["0", "-1", "x", "99999999999999999999"] {
+            let (records, issues) = tests::read(
+                Format::Csv(CsvDialect::Full),
+                format!("{head}1.5,1,Rx,data,123,1,55,,{wrong}\n"),
+            );
+            assert_eq!((records.len(), issues.len()), (0, 1), "{wrong}: {issues:?}");
         }
     }
 
@@ -237,8 +266,8 @@ mod tests {
         assert_eq!(tests::write(Format::Csv(CsvDialect::PythonCan), &records), file);
         assert_eq!(
             tests::write(Format::Csv(CsvDialect::Full), &records),
-            "time,channel,direction,type,id,dlc,data,event\n\
-             1483389946.197000,1,Rx,data,00DADADA,7,5B34322C20395D,\n"
+            "time,channel,direction,type,id,dlc,data,event,device_ns\n\
+             1483389946.197000,1,Rx,data,00DADADA,7,5B34322C20395D,,\n"
         );
     }
 

@@ -83,7 +83,7 @@ impl RowDecoder {
             digits => hex_byte(digits),
         };
         let data = Payload::words(cells, fields.data_len(), byte)?;
-        Ok(Some((TraceRecord { time_ns, channel, event: fields.event(&data)? }, None)))
+        Ok(Some((TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }, None)))
     }
 }
 

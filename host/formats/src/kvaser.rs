@@ -47,7 +47,7 @@ impl RowFormat for Decoder {
         }
         let number = text::decimal(channel).and_then(|channel| u8::try_from(channel).ok());
         let channel = number.ok_or_else(|| Fault::malformed("a channel of 0 to 255", channel))?;
-        let record = |event| TraceRecord { time_ns, channel, event };
+        let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
         let (id, mut rest) = text::word(rest);
         let (mut word, behind) = text::word(rest);
         // The mark of an extended identifier may be a separate word.

@@ -108,7 +108,7 @@ impl Decoder {
         }
         self.extended = None;
         self.has_frames = true;
-        Ok(Line::Record(TraceRecord { time_ns, channel: 1, event }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel: 1, event }))
     }
 
     /// A line of a table without labels: identifier, length and bytes.

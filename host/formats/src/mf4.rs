@@ -44,6 +44,9 @@ pub(crate) const UNFINISHED_MAGIC: &[u8] = b"UnFinMF ";
 /// The channel for events that the standard does not have, in the words of [`super::event_text`].
 const WORDS: &str = "cantap_Event";
 
+/// A frame's or event's channel for the device's own time in nanoseconds, which the standard does not have either; 0 if it is unknown.
+const DEVICE_TIME: &str = "cantap_DeviceTime";
+
 /// Where the first block is.
 const HEADER_AT: u64 = 64;
 

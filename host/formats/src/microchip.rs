@@ -47,7 +47,7 @@ impl RowFormat for Decoder {
         let fields = FrameFields { id, remote: false, direction, len: length_code(len)?, fd: None };
         let byte = |word: &[u8]| text::number(word, true).and_then(|byte| u8::try_from(byte).ok());
         let data = Payload::exactly(cells, fields.data_len(), byte)?;
-        Ok(Line::Record(TraceRecord { time_ns, channel: 1, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel: 1, event: fields.event(&data)? }))
     }
 
     fn missing(&self) -> Option<&'static str> {

@@ -230,7 +230,12 @@ impl RowFormat for Decoder {
         let id = identifier(raw, true, line)?;
         let fields =
             FrameFields { id, remote: false, direction: message.direction, len: message.len as u8, fd: None };
-        Ok(Line::Record(TraceRecord { time_ns, channel: 1, event: fields.event(&message.data)? }))
+        Ok(Line::Record(TraceRecord {
+            time_ns,
+            device_ns: None,
+            channel: 1,
+            event: fields.event(&message.data)?,
+        }))
     }
 
     fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {

@@ -158,7 +158,7 @@ impl Decode for Decoder {
         self.open = Some(capture);
         Ok(match result {
             Ok(Packet::Events(event, second)) => {
-                let record = |event| TraceRecord { time_ns, channel, event };
+                let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
                 self.packets.errors.keep(second.map(record));
                 Found::Record(record(event))
             }

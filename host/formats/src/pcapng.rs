@@ -40,6 +40,10 @@ const IF_TSRESOL: u16 = 9;
 const IF_TSOFFSET: u16 = 14;
 const EPB_FLAGS: u16 = 2;
 const EPB_DROPCOUNT: u16 = 4;
+/// Of a packet: the device's own time. Codes with the highest bit are for each program's own use, and are passed over by all others; so that it is
+/// not another program's, the value begins with [`DEVICE_NS_MAGIC`], and then has the nanoseconds in eight bytes.
+const EPB_DEVICE_NS: u16 = 0x8CA7;
+const DEVICE_NS_MAGIC: [u8; 4] = *b"ctns";
 const ISB_IFRECV: u16 = 4;
 const ISB_IFDROP: u16 = 5;
 const ISB_USRDELIV: u16 = 8;
@@ -62,13 +66,15 @@ mod tests {
     use super::{ISB_IFDROP, ISB_IFRECV, ISB_USRDELIV, STATISTICS};
     use crate::{ChannelInfo, Format, ReadOptions, TraceReader, WriteOptions, create_stream_writer};
     use cantap_can::LossStage;
-    use cantap_trace::testing::{data_record, record_or_fd};
+    use cantap_trace::testing::{data_record, record_or_fd, with_device_time};
     use cantap_trace::{Direction, TraceEvent, TraceRecord};
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1), 0..20)) {
+        fn any_trace_round_trips(
+            records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..20),
+        ) {
             prop_assert_eq!(tests::round_trip(Format::Pcapng, &records), records);
         }
     }
@@ -198,7 +204,7 @@ mod tests {
     }
 
     fn event(channel: u8, event: TraceEvent) -> TraceRecord {
-        TraceRecord { time_ns: 5, channel, event }
+        TraceRecord { time_ns: 5, device_ns: None, channel, event }
     }
 
     #[test]

@@ -83,7 +83,7 @@ impl RowFormat for Decoder {
         let data = Payload::exactly(&mut words, needed, hex_byte)?;
         let name = memchr::memmem::rfind(line, b"Channel: ").map(|at| line[at + 9..].trim_ascii());
         let channel = self.interfaces.channel(name.unwrap_or(b"can0"));
-        let record = |event| TraceRecord { time_ns, channel, event };
+        let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
         if error {
             let (event, second) = self.errors.read(raw | ERROR_FLAG, data.first_eight());
             return Ok(match second {

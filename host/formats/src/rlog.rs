@@ -177,7 +177,7 @@ fn can_data(data: &Struct<'_>, time_ns: i64) -> Result<Found, Fault> {
     if let TraceEvent::Frame { late, .. } = &mut event {
         *late = true;
     }
-    Ok(Found::Record(TraceRecord { time_ns, channel, event }))
+    Ok(Found::Record(TraceRecord { time_ns, device_ns: None, channel, event }))
 }
 
 /// Skips to what looks like an event behind the next byte, or to the end; false at the end.

@@ -136,12 +136,12 @@ fn report(line: &[u8]) -> Option<Line> {
         }
         _ => return None,
     };
-    Some(Line::Record(TraceRecord { time_ns: 0, channel: 1, event }))
+    Some(Line::Record(TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }))
 }
 
 fn lost() -> Line {
     let event = TraceEvent::Lost { stage: None, count: 1, at_least: true };
-    Line::Record(TraceRecord { time_ns: 0, channel: 1, event })
+    Line::Record(TraceRecord { time_ns: 0, device_ns: None, channel: 1, event })
 }
 
 /// Whether a line is what an adapter answers, or what it is sent.
@@ -257,7 +257,12 @@ impl RowFormat for Decoder {
             let parts = parts?;
             self.is_cut_stamp = parts.stamp.is_none();
             let event = parts.fields.event(&parts.data)?;
-            return Ok(Line::Record(TraceRecord { time_ns: self.time_ns(parts.stamp), channel: 1, event }));
+            return Ok(Line::Record(TraceRecord {
+                time_ns: self.time_ns(parts.stamp),
+                device_ns: None,
+                channel: 1,
+                event,
+            }));
         }
         if let Some(report) = report(line) {
             let time_ns = if self.clock.has_time { self.clock.time_ns } else { self.stamped_ns };

@@ -246,7 +246,7 @@ fn record(row: &Row<'_>, errors: &mut ErrorFrames) -> Result<(TraceRecord, Optio
         other => return Err(wrong_type(7, "bytes", other)),
     };
     let (event, second) = Message { id, extended, remote, error, len }.event(data, errors)?;
-    Ok((TraceRecord { time_ns, channel: 1, event }, second))
+    Ok((TraceRecord { time_ns, device_ns: None, channel: 1, event }, second))
 }
 
 fn wrong_type(column: usize, expected: &str, found: ValueRef<'_>) -> Fault {

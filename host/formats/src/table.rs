@@ -313,7 +313,7 @@ impl Decoder {
         let fd = (count > 8).then(FdFields::default);
         let len = code.map_or(count, |code| if code < 8 && !remote { count } else { code });
         let fields = FrameFields { id, remote, direction, len: len as u8, fd };
-        Ok(TraceRecord { time_ns, channel, event: fields.event(&data)? })
+        Ok(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? })
     }
 
     fn channel(&mut self, name: &[u8], form: Option<Form>) -> Result<u8, Fault> {

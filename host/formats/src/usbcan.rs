@@ -190,7 +190,7 @@ impl Decoder {
         let fields = FrameFields { id, remote, direction, len: len as u8, fd };
         let data =
             if remote { Payload::EMPTY } else { Payload::exactly(words, fields.data_len(), hex_byte)? };
-        Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
+        Ok(Line::Record(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? }))
     }
 
     /// The computer's time. One of day goes on after midnight.

@@ -39,7 +39,7 @@ fn main() -> ExitCode {
 fn record(channel: u8, at: u32, frame: &str) -> TraceRecord {
     let frame = frame.parse().expect("frames of this file are frames");
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-    TraceRecord { time_ns: i64::from(at) * 100_000, channel, event }
+    TraceRecord { time_ns: i64::from(at) * 100_000, device_ns: None, channel, event }
 }
 
 /// Frames per second, of processor time where the system provides it.

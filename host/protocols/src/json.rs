@@ -163,7 +163,8 @@ mod tests {
     use crate::{EventKind, Protocol};
 
     fn object(fields: Vec<Field>) -> serde_json::Value {
-        let record = TraceRecord { time_ns: 1_500_000_000, channel: 1, event: TraceEvent::GAP };
+        let record =
+            TraceRecord { time_ns: 1_500_000_000, device_ns: None, channel: 1, event: TraceEvent::GAP };
         let mut event = Event::new(Protocol::Uds, &record, EventKind::Exchange, "a \"title\"\n");
         event.fields = fields;
         let mut line = String::new();

@@ -10,13 +10,13 @@ use crate::{Assembler, Event};
 /// A frame on channel 1.
 pub fn at(time_ms: f64, frame: &str) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
+    TraceRecord { time_ns: (time_ms * 1e6) as i64, device_ns: None, channel: 1, event }
 }
 
 /// A lost frame on channel 1.
 pub fn lost(time_ms: f64) -> TraceRecord {
     let event = TraceEvent::Lost { stage: Some(LossStage::Queue), count: 1, at_least: false };
-    TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
+    TraceRecord { time_ns: (time_ms * 1e6) as i64, device_ns: None, channel: 1, event }
 }
 
 /// Formatted as in a frame's text.

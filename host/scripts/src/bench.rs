@@ -349,11 +349,21 @@ impl Simulation {
             self.results.frame(now_ns, channel, frame);
             let direction = if whose == Whose::Others { Direction::Rx } else { Direction::Tx };
             let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
-            self.records.push(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+            self.records.push(TraceRecord {
+                time_ns: now_ns as i64,
+                device_ns: None,
+                channel: channel.number(),
+                event,
+            });
         }
         for kind in std::mem::take(&mut wire.own.errors) {
             let event = TraceEvent::BusError { kind: Some(kind), counters: None };
-            self.records.push(TraceRecord { time_ns: now_ns as i64, channel: channel.number(), event });
+            self.records.push(TraceRecord {
+                time_ns: now_ns as i64,
+                device_ns: None,
+                channel: channel.number(),
+                event,
+            });
         }
         for place in 0..self.nodes.len() {
             let attached = &mut self.buses[channel.index()].nodes[place];

@@ -100,7 +100,7 @@ mod tests {
         let shown = |frame: &str| {
             let event =
                 TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-            let record = TraceRecord { time_ns: 0, channel: 1, event };
+            let record = TraceRecord { time_ns: 0, device_ns: None, channel: 1, event };
             decoder
                 .readings(&record)
                 .iter()

@@ -158,7 +158,8 @@ mod tests {
             let id = cantap_trace::Id::standard(1).unwrap();
             let frame = cantap_trace::Frame::data_frame(id, &[number]).unwrap().into();
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-            let record = TraceRecord { time_ns: i64::from(number) * SECOND, channel: 1, event };
+            let record =
+                TraceRecord { time_ns: i64::from(number) * SECOND, device_ns: None, channel: 1, event };
             let Ok(()) = trigger.push(&record, |record| {
                 kept.push(record.frame().unwrap().data()[0]);
                 Ok::<_, Infallible>(())

@@ -194,7 +194,12 @@ impl State {
         for (index, count) in self.unreported.iter_mut().enumerate().filter(|(_, count)| **count > 0) {
             let stage = Some(LossStage::Host);
             let event = TraceEvent::Lost { stage, count: *count, at_least: false };
-            out.push(TraceRecord { time_ns: self.lost_at_ns, channel: index as u8 + 1, event });
+            out.push(TraceRecord {
+                time_ns: self.lost_at_ns,
+                device_ns: None,
+                channel: index as u8 + 1,
+                event,
+            });
             *count = 0;
         }
     }
@@ -208,7 +213,7 @@ mod tests {
     fn frames(times: std::ops::Range<i64>) -> Vec<TraceRecord> {
         let event =
             TraceEvent::Frame { frame: "123#".parse().unwrap(), direction: Direction::Rx, late: false };
-        times.map(|time_ns| TraceRecord { time_ns, channel: 2, event }).collect()
+        times.map(|time_ns| TraceRecord { time_ns, device_ns: None, channel: 2, event }).collect()
     }
 
     /// Whoever closed the stream must find as many losses in it as the counters say.
@@ -237,7 +242,7 @@ mod tests {
         assert_eq!(buffer.push(&mut frames(15..17)), [0, 0]);
         let next = buffer.pop(None).unwrap().unwrap();
         let lost = TraceEvent::Lost { stage: Some(LossStage::Host), count: 7, at_least: false };
-        assert_eq!(next[0], TraceRecord { time_ns: 14, channel: 2, event: lost });
+        assert_eq!(next[0], TraceRecord { time_ns: 14, device_ns: None, channel: 2, event: lost });
         assert_eq!(next[1..], frames(15..17));
     }
 

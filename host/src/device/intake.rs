@@ -321,7 +321,7 @@ impl Intake {
             let time_ns = self.clock.utc(at).0.max(self.last_ns);
             sorted &= time_ns >= previous;
             previous = time_ns;
-            self.records.push(TraceRecord { time_ns, channel, event });
+            self.records.push(TraceRecord { time_ns, device_ns: at.device_ns(self.tick_hz), channel, event });
         }
         if !sorted {
             self.sort();

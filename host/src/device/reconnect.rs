@@ -260,7 +260,8 @@ where
         let time_ns = self.latest_ns.max(last_known_ns);
         let channels = device.open_channels().into_iter().map(|(channel, _)| channel.number());
         let event = TraceEvent::GAP;
-        let mut gap: Vec<_> = channels.map(|channel| TraceRecord { time_ns, channel, event }).collect();
+        let mut gap: Vec<_> =
+            channels.map(|channel| TraceRecord { time_ns, device_ns: None, channel, event }).collect();
         self.keep_in_order(&mut gap);
         self.gone = Some((Instant::now(), ago));
         self.retry_at = Instant::now() + RETRY_AFTER;

@@ -272,7 +272,7 @@ mod tests {
 
     #[test]
     fn errors_need_their_class_and_losses_always_pass() {
-        let record = |event| TraceRecord { time_ns: 0, channel: 1, event };
+        let record = |event| TraceRecord { time_ns: 0, device_ns: None, channel: 1, event };
         let error = record(TraceEvent::BusError { kind: Some(BusErrorKind::Stuff), counters: None });
         let state = record(TraceEvent::State { state: ErrorState::BusOff, counters: None });
         let lost = record(TraceEvent::Lost { stage: None, count: 1, at_least: true });

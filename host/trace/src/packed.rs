@@ -236,7 +236,7 @@ impl<'a> Rest<'a> {
             }
             DISTURBED => TraceEvent::Disturbed { length_ns: self.u32()? },
         };
-        Some(TraceRecord { time_ns, channel, event })
+        Some(TraceRecord { time_ns, device_ns: None, channel, event })
     }
 
     fn frame(&mut self, kind: u8, flags: u8) -> Option<TraceEvent> {

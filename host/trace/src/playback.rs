@@ -264,6 +264,7 @@ mod tests {
     fn at(ms: i64) -> TraceRecord {
         TraceRecord {
             time_ns: 1_000_000_000_000 + ms * MS,
+            device_ns: None,
             channel: 1,
             event: TraceEvent::ErrorsSuppressed { count: 1 },
         }

@@ -3,6 +3,7 @@
 use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
 use crate::TraceFrame;
+use crate::device_time::{DeviceNs, Moment};
 
 /// Whether a frame was received or sent by the device that wrote the trace.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -20,6 +21,9 @@ pub struct TraceRecord {
     /// Nanoseconds since the Unix epoch (UTC), or since the trace's start if the date is unknown. For a frame
     /// it is the end of the frame.
     pub time_ns: i64,
+    /// The same moment by the clock of the device that stamped it, corrected by nothing, if that is known. Two of them are as far apart as
+    /// the device measured; `time_ns` is corrected towards UTC, which changes an interval by up to 100 parts per million.
+    pub device_ns: Option<DeviceNs>,
     /// The channel, counted from 1. Devices have two; files may have more.
     pub channel: u8,
     /// What happened.
@@ -95,5 +99,11 @@ impl TraceRecord {
             TraceEvent::Frame { frame, .. } => Some(frame),
             _ => None,
         }
+    }
+
+    /// When it happened, by both clocks.
+    #[inline]
+    pub const fn moment(&self) -> Moment {
+        Moment { time_ns: self.time_ns, device_ns: self.device_ns }
     }
 }

@@ -5,7 +5,7 @@ use cantap_can::{Frame, Id};
 use proptest::prelude::*;
 
 use crate::fd::FD_LENGTHS;
-use crate::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use crate::{DeviceNs, Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 fn id() -> impl Strategy<Value = Id> {
     prop_oneof![
@@ -59,7 +59,7 @@ pub fn event() -> impl Strategy<Value = TraceEvent> {
 pub fn data_record(time_ns: i64) -> TraceRecord {
     let frame = "123#DEADBEEF".parse().unwrap();
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-    TraceRecord { time_ns, channel: 1, event }
+    TraceRecord { time_ns, device_ns: None, channel: 1, event }
 }
 
 /// Any record of a classical bus whose time is a multiple of `resolution_ns`, from 1937 to 2096.
@@ -75,6 +75,12 @@ pub fn record_or_fd(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
     )
 }
 
+/// The same records, some of which have the device's own time.
+pub fn with_device_time(records: impl Strategy<Value = TraceRecord>) -> impl Strategy<Value = TraceRecord> {
+    (records, prop::option::of(1..=u64::MAX))
+        .prop_map(|(record, ns)| TraceRecord { device_ns: ns.and_then(DeviceNs::new), ..record })
+}
+
 fn record_of(
     frame: impl Strategy<Value = TraceFrame>,
     resolution_ns: i64,
@@ -86,6 +92,7 @@ fn record_of(
     (time, 1..=4_u8, prop_oneof![4 => frame, 1 => event()]).prop_map(
         move |(time_ns, channel, event): (i64, u8, TraceEvent)| TraceRecord {
             time_ns: time_ns.div_euclid(resolution_ns) * resolution_ns,
+            device_ns: None,
             channel,
             event,
         },

@@ -171,7 +171,7 @@ fn losses(before: &[(u8, u64)], seen: Option<&[(u8, u64)]>, time_ns: i64) -> Vec
             }
             None => TraceEvent::Lost { stage: Some(LossStage::Host), count: 0, at_least: true },
         };
-        Some(TraceRecord { time_ns, channel: *channel, event })
+        Some(TraceRecord { time_ns, device_ns: None, channel: *channel, event })
     };
     before.iter().filter_map(lost).collect()
 }

@@ -268,6 +268,7 @@ impl Bus {
         let channels = self.shared.state().channels;
         let gap = |channel: &ChannelState| TraceRecord {
             time_ns: now_ns,
+            device_ns: None,
             channel: channel.channel,
             event: TraceEvent::GAP,
         };

@@ -66,7 +66,12 @@ mod tests {
     use cantap_trace::Direction;
 
     fn lost(count: u32, at_least: bool) -> TraceRecord {
-        TraceRecord { time_ns: 0, channel: 1, event: TraceEvent::Lost { stage: None, count, at_least } }
+        TraceRecord {
+            time_ns: 0,
+            device_ns: None,
+            channel: 1,
+            event: TraceEvent::Lost { stage: None, count, at_least },
+        }
     }
 
     fn run(take: impl Fn(usize) -> Option<usize>, losses: &[TraceRecord]) -> SequenceCheck {
@@ -82,7 +87,7 @@ mod tests {
             let Some(index) = take(index) else { continue };
             let event =
                 TraceEvent::Frame { frame: frames[index].into(), direction: Direction::Rx, late: false };
-            check.push(&TraceRecord { time_ns: 0, channel: 1, event });
+            check.push(&TraceRecord { time_ns: 0, device_ns: None, channel: 1, event });
         }
         check
     }

@@ -192,7 +192,7 @@ mod tests {
         for (at, text) in frames.iter().enumerate() {
             let frame: Frame = text.parse().unwrap();
             let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            meter.push(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event });
+            meter.push(&TraceRecord { time_ns: at as i64 * 1_000_000, device_ns: None, channel: 1, event });
         }
         meter
     }
@@ -205,7 +205,7 @@ mod tests {
             TraceEvent::ErrorsSuppressed { count: 40 },
             TraceEvent::ErrorsSuppressed { count: u32::MAX },
         ] {
-            meter.push(&TraceRecord { time_ns: 0, channel: 1, event });
+            meter.push(&TraceRecord { time_ns: 0, device_ns: None, channel: 1, event });
         }
         assert_eq!((meter.bus_errors(), meter.frames()), (41 + u64::from(u32::MAX), 0));
     }
@@ -229,7 +229,9 @@ mod tests {
         let event = TraceEvent::Frame { frame: switched, direction: Direction::Rx, late: false };
         let load = |data_bitrate_bps| {
             let mut meter = meter(|_| {}, &[]).with_data_bitrate(data_bitrate_bps);
-            (0..3).for_each(|at| meter.push(&TraceRecord { time_ns: at * 1_000_000, channel: 1, event }));
+            (0..3).for_each(|at| {
+                meter.push(&TraceRecord { time_ns: at * 1_000_000, device_ns: None, channel: 1, event })
+            });
             (meter.bus_load_pct(), meter.no_bus_load_because())
         };
         let bits = switched.bus_bits();
@@ -244,7 +246,7 @@ mod tests {
     fn rate_and_load_are_over_the_same_time_where_frames_were_lost() {
         let mut meter = meter(|_| {}, &["123#0011", "123#0011", "123#0011"]);
         let before = (meter.frames_per_s(), meter.bus_load_pct());
-        let record = |time_ns, event| TraceRecord { time_ns, channel: 1, event };
+        let record = |time_ns, event| TraceRecord { time_ns, device_ns: None, channel: 1, event };
         meter.push(&record(60_000_000_000, TraceEvent::Lost { stage: None, count: 60_000, at_least: false }));
         for ms in [60_000, 60_001] {
             let frame: Frame = "123#0011".parse().unwrap();
@@ -262,7 +264,7 @@ mod tests {
         for at in 0..8 {
             let frame: Frame = "123#0011".parse().unwrap();
             let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            let record = TraceRecord { time_ns: at * 1_000_000, channel: 1, event };
+            let record = TraceRecord { time_ns: at * 1_000_000, device_ns: None, channel: 1, event };
             if at % 4 == 0 { some.push(&record) } else { some.pass_by(&record) }
         }
         assert_eq!((some.frames(), some.frames_per_s()), (2, Some(250.0)));

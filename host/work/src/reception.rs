@@ -105,7 +105,7 @@ mod tests {
     const ERROR: TraceEvent = TraceEvent::BusError { kind: None, counters: None };
 
     fn record(channel: u8, event: TraceEvent) -> TraceRecord {
-        TraceRecord { time_ns: 0, channel, event }
+        TraceRecord { time_ns: 0, device_ns: None, channel, event }
     }
 
     #[test]

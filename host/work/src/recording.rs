@@ -246,7 +246,7 @@ mod tests {
     fn frame(second: i64, frame: &str) -> TraceRecord {
         let event =
             TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: second * 1_000_000_000, channel: 1, event }
+        TraceRecord { time_ns: second * 1_000_000_000, device_ns: None, channel: 1, event }
     }
 
     fn fast() -> Around {

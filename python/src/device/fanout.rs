@@ -258,7 +258,7 @@ impl Fanout {
     /// From a time (UTC nanoseconds) on, a channel received nothing for a moment: a loss says so.
     pub fn add_gap(&self, channel: Channel, time_ns: i64) {
         let event = TraceEvent::Lost { stage: Some(LossStage::Controller), count: 0, at_least: true };
-        lock(&self.gaps).push(TraceRecord { time_ns, channel: channel.number(), event });
+        lock(&self.gaps).push(TraceRecord { time_ns, device_ns: None, channel: channel.number(), event });
     }
 
     /// Puts gaps in their places. One that is later than everything in a batch belongs to the next one.

@@ -116,7 +116,7 @@ impl Row {
     /// Its last frame as a record.
     pub fn last(&self) -> TraceRecord {
         let event = TraceEvent::Frame { frame: self.frame, direction: self.direction, late: false };
-        TraceRecord { time_ns: self.last_ns, channel: self.channel, event }
+        TraceRecord { time_ns: self.last_ns, device_ns: None, channel: self.channel, event }
     }
 
     /// Suppresses changes of all bits that have changed so far.
@@ -241,7 +241,7 @@ mod tests {
     fn take(table: &mut FixedTable, time_ms: i64, text: &str) {
         let frame = text.parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-        table.take(&TraceRecord { time_ns: time_ms * 1_000_000, channel: 1, event });
+        table.take(&TraceRecord { time_ns: time_ms * 1_000_000, device_ns: None, channel: 1, event });
     }
 
     #[test]
@@ -318,6 +318,7 @@ mod tests {
         }
         table.take(&TraceRecord {
             time_ns: 0,
+            device_ns: None,
             channel: 1,
             event: TraceEvent::Lost { stage: None, count: 1, at_least: false },
         });

@@ -257,6 +257,7 @@ mod tests {
         for n in 0..2500 {
             history.push(TraceRecord {
                 time_ns: n,
+                device_ns: None,
                 channel: 1,
                 event: TraceEvent::ErrorsSuppressed { count: 0 },
             });
@@ -272,7 +273,7 @@ mod tests {
     fn frame(n: i64) -> TraceRecord {
         let frame = if n % 3 == 0 { "123#" } else { "124#" }.parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: n, channel: 1, event }
+        TraceRecord { time_ns: n, device_ns: None, channel: 1, event }
     }
 
     #[test]
@@ -292,7 +293,7 @@ mod tests {
         let event = |at: i64| {
             let frame = format!("123##1{}", "00".repeat(64)).parse().unwrap();
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-            TraceRecord { time_ns: at, channel: 1, event }
+            TraceRecord { time_ns: at, device_ns: None, channel: 1, event }
         };
         (0..4000).for_each(|n| history.push(event(n)));
         let (used, most) = history.memory();

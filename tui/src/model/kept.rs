@@ -61,7 +61,7 @@ impl Kept {
             What::Disturbed { length_ns } => TraceEvent::Disturbed { length_ns: *length_ns },
             What::Fd(number) => elsewhere(*number)?,
         };
-        Some(TraceRecord { time_ns: self.time_ns, channel: self.channel, event })
+        Some(TraceRecord { time_ns: self.time_ns, device_ns: None, channel: self.channel, event })
     }
 }
 
@@ -86,7 +86,7 @@ mod tests {
             TraceEvent::GAP,
             TraceEvent::TransmitFailed { tag: 3, reason: TransmitFailure::Overtaken { periods: 9 } },
         ] {
-            let record = TraceRecord { time_ns: -5, channel: 2, event };
+            let record = TraceRecord { time_ns: -5, device_ns: None, channel: 2, event };
             let kept = Kept::new(&record, 7);
             assert_eq!(kept.record(|number| (number == 7).then_some(event)), Some(record));
         }

@@ -51,7 +51,7 @@ impl SignalRow {
     /// The frame with the last value, as a record.
     pub fn last(&self) -> TraceRecord {
         let event = TraceEvent::Frame { frame: self.frame, direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: self.time_ns, channel: self.channel, event }
+        TraceRecord { time_ns: self.time_ns, device_ns: None, channel: self.channel, event }
     }
 }
 

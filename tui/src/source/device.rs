@@ -391,7 +391,12 @@ impl Source<'_> {
     /// spans it.
     fn note_gap(&mut self, channels: &[u8]) {
         let time_ns = UtcClock::start().at(Instant::now()).0;
-        let gap = |channel: &u8| TraceRecord { time_ns, channel: *channel, event: TraceEvent::GAP };
+        let gap = |channel: &u8| TraceRecord {
+            time_ns,
+            device_ns: None,
+            channel: *channel,
+            event: TraceEvent::GAP,
+        };
         let mut gap: Vec<_> = channels.iter().map(gap).collect();
         self.keep_up(&mut gap);
         self.take(&gap);

@@ -51,7 +51,12 @@ fn errors_are_red_and_what_follows_a_loss_is_yellow_with_the_number() {
 #[test]
 fn digits_that_changed_are_marked_fade_and_can_be_notched() {
     let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 0).unwrap();
-    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    let at = |ms: i64, text: &str| TraceRecord {
+        time_ns: ms * 1_000_000,
+        device_ns: None,
+        channel: 1,
+        event: frame(text),
+    };
     model.take(&[at(0, "123#1020"), at(10, "123#1320")]);
     let (mut app, _orders) = app(View::Fixed);
     // Only the low half of the first byte.
@@ -74,7 +79,12 @@ fn digits_that_changed_are_marked_fade_and_can_be_notched() {
 #[test]
 fn only_what_changed_since_a_key_was_pressed_is_shown_and_marked() {
     let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 0).unwrap();
-    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    let at = |ms: i64, text: &str| TraceRecord {
+        time_ns: ms * 1_000_000,
+        device_ns: None,
+        channel: 1,
+        event: frame(text),
+    };
     model.take(&[at(0, "123#1020"), at(0, "124#55"), at(10, "123#1120")]);
     let (mut app, _orders) = app(View::Fixed);
     let text = |app: &mut App, model: &Model| screen_text(app, model, (40, 12)).unwrap();
@@ -123,7 +133,7 @@ fn alarms_are_red_above_and_blue_below_each_with_its_arrow() {
     for (data, arrow, colour) in [("FF", "▲", Color::LightRed), ("01", "▼", Color::LightBlue)] {
         let mut model = Model::new(Arc::clone(&decoder), Options::default(), 0).unwrap();
         let event: TraceEvent = frame(&format!("123#{data}"));
-        model.take(&[TraceRecord { time_ns: 0, channel: 1, event }]);
+        model.take(&[TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }]);
         let (mut app, _orders) = app(View::Signals);
         press(&mut app, &mut model, "j");
         assert_eq!(style_of(&buffer(&mut app, &model), arrow).0, colour);

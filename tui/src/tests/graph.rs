@@ -20,7 +20,12 @@ fn model(history_bytes: usize) -> Model {
 }
 
 fn sample(at_ns: i64, speed: u8, brake: u8) -> TraceRecord {
-    TraceRecord { time_ns: NOON + at_ns, channel: 1, event: frame(&format!("100#{speed:02X}00{brake:02X}")) }
+    TraceRecord {
+        time_ns: NOON + at_ns,
+        device_ns: None,
+        channel: 1,
+        event: frame(&format!("100#{speed:02X}00{brake:02X}")),
+    }
 }
 
 fn keys(app: &mut App, model: &mut Model, codes: &[KeyCode]) {
@@ -120,10 +125,10 @@ fn nothing_is_drawn_across_a_loss_nor_after_the_last_value() {
     model.take(&[
         sample(0, 50, 1),
         sample(2 * S, 50, 1),
-        TraceRecord { time_ns: NOON + 3 * S, channel: 1, event: lost },
+        TraceRecord { time_ns: NOON + 3 * S, device_ns: None, channel: 1, event: lost },
         sample(6 * S, 50, 1),
         sample(7 * S, 50, 1),
-        TraceRecord { time_ns: NOON + 10 * S, channel: 1, event: frame("7FF#") },
+        TraceRecord { time_ns: NOON + 10 * S, device_ns: None, channel: 1, event: frame("7FF#") },
     ]);
     let (mut app, _orders) = app(View::Graph);
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();

@@ -62,7 +62,7 @@ fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
     let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 16_000_000).unwrap();
     let record = |n: i64| {
         let event = super::frame(if n == 1000 { "7AB#" } else { "123#11" });
-        TraceRecord { time_ns: n, channel: 1, event }
+        TraceRecord { time_ns: n, device_ns: None, channel: 1, event }
     };
     model.take(&(0..350_000).map(record).collect::<Vec<_>>());
     let (mut app, _orders) = app(View::Trace);

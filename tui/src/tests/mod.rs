@@ -84,7 +84,7 @@ fn model() -> Model {
     let records = open_reader(log, &ReadOptions::default()).unwrap();
     let mut records: Vec<_> = records.take(6000).map(Result::unwrap).collect();
     let before = records[5993].time_ns;
-    let insert = |time_ns, channel, event| TraceRecord { time_ns, channel, event };
+    let insert = |time_ns, channel, event| TraceRecord { time_ns, device_ns: None, channel, event };
     records.insert(
         5994,
         insert(before, 1, TraceEvent::BusError { kind: Some(BusErrorKind::Crc), counters: Some((0, 1)) }),
@@ -298,7 +298,12 @@ fn the_scripts_page_is_as_agreed() {
 #[test]
 fn transfers_under_way_are_shown_until_they_end() {
     let mut model = Model::new(database("version = 1"), Options::default(), 1_000_000).unwrap();
-    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    let at = |ms: i64, text: &str| TraceRecord {
+        time_ns: ms * 1_000_000,
+        device_ns: None,
+        channel: 1,
+        event: frame(text),
+    };
     let talk = |from: i64| {
         [
             at(from, "7E0#0322F190"),

@@ -14,7 +14,12 @@ use super::{SIGNALS, app, database, frame, model, press, screen_text};
 
 fn car() -> Model {
     let mut model = Model::new(database(SIGNALS), Options::default(), 1_000_000).unwrap();
-    let at = |s: i64, text: &str| TraceRecord { time_ns: s * 1_000_000_000, channel: 1, event: frame(text) };
+    let at = |s: i64, text: &str| TraceRecord {
+        time_ns: s * 1_000_000_000,
+        device_ns: None,
+        channel: 1,
+        event: frame(text),
+    };
     model.take(&[at(43_200, "100#0A64"), at(43_201, "200#01"), at(43_202, "100#14C8")]);
     model.source = SourceState::Running;
     model
@@ -116,7 +121,12 @@ fn the_fixed_page_is_narrowed_by_signals_with_a_condition_of_its_own() {
     }
     press(&mut app, &mut model, "alarm\n");
     assert_eq!(ids(&mut app, &model), ["100"]);
-    model.take(&[TraceRecord { time_ns: 43_203_000_000_000, channel: 1, event: frame("100#1464") }]);
+    model.take(&[TraceRecord {
+        time_ns: 43_203_000_000_000,
+        device_ns: None,
+        channel: 1,
+        event: frame("100#1464"),
+    }]);
     assert_eq!(ids(&mut app, &model), [""; 0]);
 }
 
@@ -162,7 +172,7 @@ fn the_second_line_tells_mode_rates_errors_and_bus_off_as_far_as_there_is_room()
     let (mut app, _orders) = app(View::Fixed);
     press(&mut app, &mut model, "my");
     let state = TraceEvent::State { state: ErrorState::BusOff, counters: None };
-    model.take(&[TraceRecord { time_ns: model.seen.now_ns, channel: 1, event: state }]);
+    model.take(&[TraceRecord { time_ns: model.seen.now_ns, device_ns: None, channel: 1, event: state }]);
     let wide = screen(&mut app, &model, (160, 24)).unwrap();
     let line: String = (0..160).map(|column| wide[(column, 1)].symbol()).collect();
     for part in ["virtual NORMAL: running", "1: BUS-OFF, R recovers", "1 250k ", "/s", "errors 1", "lost 17"]
@@ -252,7 +262,7 @@ fn a_trace_opens_beside_and_a_database_decodes_what_was_seen_before() {
     let trace = write("drive.log", "(1.0) can0 123#11\n");
     let database = write("car.toml", SIGNALS);
     let mut model = Model::new(super::database("version = 1\n"), Options::default(), 1_000_000).unwrap();
-    model.take(&[TraceRecord { time_ns: 0, channel: 1, event: frame("100#0A64") }]);
+    model.take(&[TraceRecord { time_ns: 0, device_ns: None, channel: 1, event: frame("100#0A64") }]);
     let (mut app, orders) = app(View::Signals);
     press(&mut app, &mut model, "D");
     app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);

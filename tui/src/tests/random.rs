@@ -100,7 +100,7 @@ fn record(random: &mut fastrand::Rng, now_ns: &mut i64) -> TraceRecord {
         6 => frame("7FF#R4"),
         _ => frame(&format!("{:03X}#{:016X}", random.u16(..0x800), random.u64(..))),
     };
-    TraceRecord { time_ns: *now_ns, channel: random.u8(1..4), event }
+    TraceRecord { time_ns: *now_ns, device_ns: None, channel: random.u8(1..4), event }
 }
 
 /// Something happens besides the user's keys.

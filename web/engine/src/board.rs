@@ -113,6 +113,7 @@ impl Board {
         }
         let gap = |channel: Channel| TraceRecord {
             time_ns: self.latest_ns,
+            device_ns: None,
             channel: channel.number(),
             event: TraceEvent::GAP,
         };

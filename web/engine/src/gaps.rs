@@ -128,7 +128,7 @@ mod tests {
         for (time_ns, event) in
             [(10, frame), (20, lost(3)), (25, lost(4)), (30, frame), (40, off), (60, frame), (70, lost(1))]
         {
-            gaps.push(&TraceRecord { time_ns, channel: 1, event });
+            gaps.push(&TraceRecord { time_ns, device_ns: None, channel: 1, event });
         }
         let found: Vec<_> = gaps.all(90).map(|gap| (gap.from_ns, gap.to_ns, gap.stage, gap.count)).collect();
         assert_eq!(found, [(10, 30, "queue", 7), (40, 60, BUS_OFF, 0), (60, 90, "queue", 1)]);

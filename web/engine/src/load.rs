@@ -152,7 +152,7 @@ mod tests {
         let period = bits * 2000;
         for n in 1..=1000 {
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-            store.push(&TraceRecord { time_ns: n * period, channel: 1, event });
+            store.push(&TraceRecord { time_ns: n * period, device_ns: None, channel: 1, event });
         }
         let mut channel = ChannelBits::default();
         channel.extend(1, &store);

@@ -323,7 +323,12 @@ mod tests {
             let frame =
                 Frame::data_frame(Id::standard(0x123).unwrap(), &[n as u8 % 4, value[0], value[1]]).unwrap();
             let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            store.push(&TraceRecord { time_ns: n as i64 * 1000 + random.i64(0..900), channel: 1, event });
+            store.push(&TraceRecord {
+                time_ns: n as i64 * 1000 + random.i64(0..900),
+                device_ns: None,
+                channel: 1,
+                event,
+            });
         }
         (store, (0..frames as u32).collect())
     }

@@ -202,7 +202,12 @@ impl Block {
         let (time_ns, channel) = (*self.times.get(at)?, self.channels[at]);
         let (packed, kind, data) = (self.ids[at], self.kinds[at], self.data[at]);
         if kind >> 4 == EVENT {
-            return Some(TraceRecord { time_ns, channel, event: *self.events.get(data as usize)? });
+            return Some(TraceRecord {
+                time_ns,
+                device_ns: None,
+                channel,
+                event: *self.events.get(data as usize)?,
+            });
         }
         let id = unpack_id(packed);
         let frame = match kind >> 4 {
@@ -222,7 +227,7 @@ impl Block {
         };
         let direction = if packed & SENT == 0 { Direction::Rx } else { Direction::Tx };
         let event = TraceEvent::Frame { frame, direction, late: packed & LATE != 0 };
-        Some(TraceRecord { time_ns, channel, event })
+        Some(TraceRecord { time_ns, device_ns: None, channel, event })
     }
 }
 
@@ -254,7 +259,7 @@ mod tests {
         let mut store = Store::default();
         let event = TraceEvent::GAP;
         for n in 0..BLOCK_ROWS as i64 + 10 {
-            store.push(&TraceRecord { time_ns: n * 10, channel: 1, event });
+            store.push(&TraceRecord { time_ns: n * 10, device_ns: None, channel: 1, event });
         }
         for (time, row) in
             [(-5, 0), (0, 0), (1, 1), (655_360, 65_536), (655_361, 65_537), (9_999_999, 65_546)]

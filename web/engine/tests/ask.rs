@@ -391,7 +391,7 @@ fn live(from: i64, count: i64) -> Vec<u8> {
         let frame = if n % 4 == 0 { format!("123#{:04X}", n % 65_536) } else { "456#00".to_owned() };
         let event =
             TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: 1_700_000_000_000_000_000 + n * 1_000_000, channel: 1, event }
+        TraceRecord { time_ns: 1_700_000_000_000_000_000 + n * 1_000_000, device_ns: None, channel: 1, event }
     };
     let records: Vec<_> = (from..from + count).map(record).collect();
     let mut bytes = Vec::new();

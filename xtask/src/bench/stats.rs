@@ -46,7 +46,7 @@ fn records(ids: u32) -> Vec<TraceRecord> {
             let id = Id::extended_truncated((random % u64::from(ids)) as u32 * 8191);
             let frame = Frame::from_bus(id, false, 8, random.to_be_bytes());
             let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            TraceRecord { time_ns: n as i64 * 70_000, channel: 1 + (n % 2) as u8, event }
+            TraceRecord { time_ns: n as i64 * 70_000, device_ns: None, channel: 1 + (n % 2) as u8, event }
         })
         .collect()
 }

@@ -235,7 +235,7 @@ fn a_bus_on_which_nothing_leaves_does_not_hold_up_the_other() {
 fn received(frame: &str) -> TraceRecord {
     let frame = frame.parse().unwrap();
     let event = TraceEvent::Frame { frame, direction: cantap::Direction::Rx, late: false };
-    TraceRecord { time_ns: 0, channel: 1, event }
+    TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }
 }
 
 #[test]
@@ -329,7 +329,7 @@ fn frames_heard_and_frames_counted_are_all_there_were() {
         Box::new(Arc::clone(&memory)),
         Known { echoes: false, has_fd: false },
     );
-    let of_frames = |event| TraceRecord { time_ns: 0, channel: 1, event };
+    let of_frames = |event| TraceRecord { time_ns: 0, device_ns: None, channel: 1, event };
     let error = of_frames(TraceEvent::BusError { kind: None, counters: None });
     let lost = of_frames(TraceEvent::Lost { stage: Some(LossStage::Queue), count: 10, at_least: false });
     lane.hear(&[received("101#"), lost, received("102#"), received("103#"), error, received("104#")])

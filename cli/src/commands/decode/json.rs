@@ -19,6 +19,9 @@ pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Resu
         record.channel,
         frame.id()
     )?;
+    if let Some(device_ns) = record.device_ns {
+        write!(out, "\"device_ns\":{},", device_ns.get())?;
+    }
     out.write_all(b"\"message\":")?;
     serde_json::to_writer(&mut *out, &message.name)?;
     out.write_all(b",\"signals\":{")?;

@@ -111,7 +111,7 @@ mod tests {
         let mut prediction = Prediction::new(frame.id(), 1, 2000);
         for end_ms in ends_ms {
             let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-            prediction.take(&TraceRecord { time_ns: end_ms * 1_000_000, channel: 1, event });
+            prediction.take(&TraceRecord { time_ns: end_ms * 1_000_000, device_ns: None, channel: 1, event });
         }
         prediction
     }

@@ -110,7 +110,7 @@ mod tests {
         let mut traffic = Traffic::default();
         traffic.set_bit_rate(1, 500_000);
         traffic.set_bit_rate(2, 250_000);
-        let record = |event| TraceRecord { time_ns: 0, channel: 1, event };
+        let record = |event| TraceRecord { time_ns: 0, device_ns: None, channel: 1, event };
         let frame =
             TraceEvent::Frame { frame: "123#".parse().unwrap(), direction: Direction::Rx, late: false };
         let bits = u64::from(frame_bits(&frame));

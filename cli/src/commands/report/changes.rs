@@ -90,7 +90,7 @@ mod tests {
         for (time_ms, frame) in frames {
             let event =
                 TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-            profile.add(&TraceRecord { time_ns: time_ms * 1_000_000, channel: 1, event });
+            profile.add(&TraceRecord { time_ns: time_ms * 1_000_000, device_ns: None, channel: 1, event });
         }
         profile
     }

@@ -9,6 +9,7 @@ pub(super) fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceR
     let frame = Frame::data_frame(Id::standard(id.into()).unwrap(), &content.to_le_bytes()).unwrap();
     TraceRecord {
         time_ns,
+        device_ns: None,
         channel,
         event: TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false },
     }
@@ -48,6 +49,7 @@ pub(super) fn heard(records: &[TraceRecord], channel: u8, clock: Clock, seed: u6
         .iter()
         .map(|record| TraceRecord {
             time_ns: start + clock.read(record.time_ns - start, &mut random),
+            device_ns: None,
             channel,
             event: record.event,
         })

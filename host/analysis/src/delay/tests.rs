@@ -9,12 +9,12 @@ const OPTIONS: DelayOptions = DelayOptions { from: 1, to: 2, within_ns: 100 * MS
 /// A frame on a channel, at a time in milliseconds.
 fn on(channel: u8, ms: i64, frame: &str) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns: ms * MS, channel, event }
+    TraceRecord { time_ns: ms * MS, device_ns: None, channel, event }
 }
 
 fn lost(channel: u8, ms: i64, stage: LossStage) -> TraceRecord {
     let event = TraceEvent::Lost { stage: Some(stage), count: 3, at_least: false };
-    TraceRecord { time_ns: ms * MS, channel, event }
+    TraceRecord { time_ns: ms * MS, device_ns: None, channel, event }
 }
 
 #[allow(clippy::unnecessary_wraps, reason = "as a map is")]

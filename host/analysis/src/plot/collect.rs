@@ -121,7 +121,7 @@ mod testing {
     pub(super) fn frame(time_ms: i64, text: &str) -> TraceRecord {
         let frame = text.parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: time_ms * 1_000_000, channel: 1, event }
+        TraceRecord { time_ns: time_ms * 1_000_000, device_ns: None, channel: 1, event }
     }
 
     pub(super) fn lost(time_ms: i64, count: u32) -> TraceRecord {

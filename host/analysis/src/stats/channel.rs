@@ -5,7 +5,7 @@ use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use super::ids::{IdStatistics, Ids};
 use super::windows::{Window, Windows, per_second};
 use super::work_load::WorkLoad;
-use cantap_trace::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{Direction, Id, Moment, TraceEvent, TraceFrame, TraceRecord};
 
 /// Statistics of one channel.
 #[derive(Clone, Debug)]
@@ -180,7 +180,7 @@ impl ChannelStatistics {
         }
         match record.event {
             TraceEvent::Frame { frame, direction, late } => {
-                self.frame(&frame, direction, late, time_ns, closed);
+                self.frame(&frame, direction, late, record.moment(), closed);
             }
             TraceEvent::BusError { kind, counters } => {
                 match kind {
@@ -225,9 +225,10 @@ impl ChannelStatistics {
         frame: &TraceFrame,
         direction: Direction,
         late: bool,
-        end_ns: i64,
+        end: Moment,
         closed: &mut impl FnMut(&Window),
     ) {
+        let end_ns = end.time_ns;
         let on_bus = frame.bus_bits();
         if frame.is_fd() {
             self.fd_frame(frame, on_bus.data > 0);
@@ -267,7 +268,7 @@ impl ChannelStatistics {
             load.frame(end_ns, f64::from(on_bus.nominal) + data);
         }
         self.windows.frame(end_ns, on_bus, closed);
-        self.ids.add(frame, direction, bits, end_ns, self.gaps);
+        self.ids.add(frame, direction, bits, end, self.gaps);
     }
 
     #[cold]

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
-use cantap_trace::{Direction, Id, TraceFrame};
+use cantap_trace::{DeviceNs, Direction, Id, Moment, TraceFrame};
 
 /// How many identifiers are tracked individually on each channel. Random or hostile traffic may have half a
 /// billion; frames of identifiers beyond this number are counted together.
@@ -81,7 +81,8 @@ pub struct IdStatistics {
     pub sent: u64,
     /// Bits of its frames, with stuff bits and intermission.
     pub bits: u64,
-    /// Intervals between its frames. An interval in which frames were lost on the channel is left out.
+    /// Intervals between its frames, by the device's clock where both have its time. An interval in which frames were lost on the channel is
+    /// left out.
     pub period: Period,
     /// End of the first frame, in nanoseconds.
     pub first_ns: i64,
@@ -93,12 +94,14 @@ pub struct IdStatistics {
     pub dlcs_seen: u16,
     /// How often a frame's DLC differed from the one before.
     pub dlc_changes: u64,
+    /// The device's time of that end, if it is known.
+    last_device_ns: Option<DeviceNs>,
     /// The channel's number of gaps at its last frame.
     generation: u32,
 }
 
 impl IdStatistics {
-    fn new(frame: &TraceFrame, end_ns: i64, generation: u32) -> Self {
+    fn new(frame: &TraceFrame, end: Moment, generation: u32) -> Self {
         Self {
             id: frame.id(),
             frames: 0,
@@ -106,8 +109,9 @@ impl IdStatistics {
             sent: 0,
             bits: 0,
             period: Period::default(),
-            first_ns: end_ns,
-            last_ns: end_ns,
+            first_ns: end.time_ns,
+            last_ns: end.time_ns,
+            last_device_ns: end.device_ns,
             dlc: frame.dlc(),
             dlcs_seen: 0,
             dlc_changes: 0,
@@ -116,9 +120,9 @@ impl IdStatistics {
     }
 
     #[inline]
-    fn add(&mut self, frame: &TraceFrame, direction: Direction, bits: u32, end_ns: i64, generation: u32) {
+    fn add(&mut self, frame: &TraceFrame, direction: Direction, bits: u32, end: Moment, generation: u32) {
         if self.frames > 0 && self.generation == generation {
-            let interval = end_ns.saturating_sub(self.last_ns);
+            let interval = end.since_ns(Moment { time_ns: self.last_ns, device_ns: self.last_device_ns });
             if interval >= 0 {
                 self.period.add(interval);
             }
@@ -127,7 +131,8 @@ impl IdStatistics {
         self.remote += u64::from(frame.is_remote());
         self.sent += u64::from(direction == Direction::Tx);
         self.bits += u64::from(bits);
-        self.last_ns = end_ns;
+        self.last_ns = end.time_ns;
+        self.last_device_ns = end.device_ns;
         self.generation = generation;
         self.dlc_changes += u64::from(self.dlc != frame.dlc());
         self.dlc = frame.dlc();
@@ -157,7 +162,7 @@ impl Ids {
         frame: &TraceFrame,
         direction: Direction,
         bits: u32,
-        end_ns: i64,
+        end: Moment,
         generation: u32,
     ) {
         let id = frame.id();
@@ -166,7 +171,7 @@ impl Ids {
             Some(place) => *place as usize,
             None if self.listed.len() < MOST_IDS => {
                 self.place_of.insert(key, self.listed.len() as u32);
-                self.listed.push(IdStatistics::new(frame, end_ns, generation));
+                self.listed.push(IdStatistics::new(frame, end, generation));
                 self.listed.len() - 1
             }
             None => {
@@ -174,7 +179,7 @@ impl Ids {
                 return;
             }
         };
-        self.listed[place].add(frame, direction, bits, end_ns, generation);
+        self.listed[place].add(frame, direction, bits, end, generation);
     }
 
     pub(super) fn iter(&self) -> impl Iterator<Item = &IdStatistics> {
@@ -220,7 +225,7 @@ mod tests {
 
     fn add(ids: &mut Ids, text: &str, end_ns: i64, generation: u32) {
         let frame: TraceFrame = text.parse().unwrap();
-        ids.add(&frame, Direction::Rx, 50, end_ns, generation);
+        ids.add(&frame, Direction::Rx, 50, Moment { time_ns: end_ns, device_ns: None }, generation);
     }
 
     #[test]
@@ -242,6 +247,22 @@ mod tests {
         }
         let period = &ids.iter().next().unwrap().period;
         assert_eq!((period.count(), period.max_ns()), (2, Some(10)));
+    }
+
+    /// UTC is corrected by up to 100 ppm: 10 us in a period of 100 ms, which is no jitter of the bus.
+    #[test]
+    fn a_period_is_as_the_device_measured_it() {
+        let mut ids = Ids::default();
+        let frame: TraceFrame = "123#".parse().unwrap();
+        for n in 0..50_u64 {
+            let corrected = if n % 2 == 0 { 0 } else { 10_000 };
+            let (time_ns, device_ns) = (n as i64 * 100_000_000 + corrected, 7_000_000 + n * 100_000_000);
+            let end = Moment { time_ns, device_ns: DeviceNs::new(device_ns) };
+            ids.add(&frame, Direction::Rx, 50, end, 0);
+        }
+        let period = &ids.iter().next().unwrap().period;
+        assert_eq!((period.min_ns(), period.max_ns()), (Some(100_000_000), Some(100_000_000)));
+        assert_eq!((period.count(), period.jitter_ns()), (49, Some(0.0)));
     }
 
     #[test]
@@ -277,7 +298,7 @@ mod tests {
         let mut ids = Ids::default();
         for raw in 0..MOST_IDS as u32 + 10 {
             let frame = cantap_trace::Frame::data_frame(Id::extended_truncated(raw), &[]).unwrap().into();
-            ids.add(&frame, Direction::Rx, 50, 0, 0);
+            ids.add(&frame, Direction::Rx, 50, Moment { time_ns: 0, device_ns: None }, 0);
         }
         assert_eq!((ids.len(), ids.unlisted_frames), (MOST_IDS, 10));
     }

@@ -5,7 +5,7 @@ use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_trace::{Direction, TraceEvent};
 
 fn at(time_us: i64, channel: u8, event: TraceEvent) -> TraceRecord {
-    TraceRecord { time_ns: time_us * 1000, channel, event }
+    TraceRecord { time_ns: time_us * 1000, device_ns: None, channel, event }
 }
 
 fn frame(time_us: i64, channel: u8, text: &str) -> TraceRecord {

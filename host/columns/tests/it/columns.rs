@@ -90,6 +90,7 @@ fn frame(time_ns: i64, text: &str) -> TraceRecord {
     let frame = text.parse().unwrap();
     TraceRecord {
         time_ns,
+        device_ns: None,
         channel: 2,
         event: TraceEvent::Frame { frame, direction: Direction::Rx, late: false },
     }
@@ -101,7 +102,7 @@ fn values_have_names_texts_units_and_losses_beside_them() {
     let mut columns = SignalColumns::new(&decoder);
     let trace = [
         frame(1_000, "100#0364000000000000"),
-        TraceRecord { time_ns: 2_000, channel: 2, event: TraceEvent::GAP },
+        TraceRecord { time_ns: 2_000, device_ns: None, channel: 2, event: TraceEvent::GAP },
         frame(3_000, "100#0138FF"),
     ];
     let mut values = Vec::new();
@@ -229,7 +230,7 @@ proptest! {
                 None => FdFrame::new(id, true, false, &bytes[..*len]).unwrap().into(),
             };
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-            let record = TraceRecord { time_ns: at as i64, channel: 1, event };
+            let record = TraceRecord { time_ns: at as i64, device_ns: None, channel: 1, event };
             prop_assert_eq!(decoder.decode(1, &frame, &mut values), Some(reference));
             prop_assert!(!together.has_value(frame.data_len()) || !values.is_empty());
             together.push(&record);

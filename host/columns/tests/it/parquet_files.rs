@@ -17,6 +17,7 @@ fn frame(time_ns: i64, channel: u8) -> TraceRecord {
     let frame = "123#DEADBEEF".parse().unwrap();
     TraceRecord {
         time_ns,
+        device_ns: None,
         channel,
         event: TraceEvent::Frame { frame, direction: Direction::Tx, late: false },
     }

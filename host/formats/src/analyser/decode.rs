@@ -102,8 +102,12 @@ impl RowDecoder {
                 )
             })?;
         let second = (cell(20) == b"Y").then_some(OVERRUN);
-        let record =
-            |event| TraceRecord { time_ns: self.start_ns.saturating_add(offset_ns), channel: 1, event };
+        let record = |event| TraceRecord {
+            time_ns: self.start_ns.saturating_add(offset_ns),
+            device_ns: None,
+            channel: 1,
+            event,
+        };
         let kinds = ERRORS.iter().enumerate();
         let told: Vec<_> =
             kinds.filter(|(at, _)| !matches!(cell(14 + at), b"" | b"N")).map(|(_, kind)| *kind).collect();

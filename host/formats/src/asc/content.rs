@@ -28,7 +28,7 @@ impl OnChannel {
     /// The same for a line at this time on this channel.
     pub(super) fn on(self, time_ns: i64, channel: u8) -> Content {
         match self {
-            Self::Event(event) => Content::Record(TraceRecord { time_ns, channel, event }),
+            Self::Event(event) => Content::Record(TraceRecord { time_ns, device_ns: None, channel, event }),
             Self::Request => Content::Request,
             Self::LeftOut(what) => Content::LeftOut(what),
         }

@@ -336,7 +336,12 @@ impl Decoder {
         let frames = self.classical().take(room).map(|frame| {
             let Classical { time_ns, channel, id, direction, remote, dlc, data } = frame;
             let frame = Frame::from_bus(id, remote, dlc, data).into();
-            TraceRecord { time_ns, channel, event: TraceEvent::Frame { frame, direction, late: false } }
+            TraceRecord {
+                time_ns,
+                device_ns: None,
+                channel,
+                event: TraceEvent::Frame { frame, direction, late: false },
+            }
         });
         let before = records.len();
         records.extend(frames);
@@ -432,7 +437,7 @@ impl Decoder {
         match event(kind, &object[header_len..], told) {
             Ok(Content::Event(channel, event)) => {
                 self.loss_told = kind == EVENT_COMMENT && matches!(event, TraceEvent::Lost { .. });
-                Object::Event(TraceRecord { time_ns, channel, event })
+                Object::Event(TraceRecord { time_ns, device_ns: None, channel, event })
             }
             Ok(Content::Request) => Object::Request,
             Ok(Content::LeftOut(what)) => Object::LeftOut(what),

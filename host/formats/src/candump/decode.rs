@@ -161,7 +161,7 @@ impl Decoder {
         let frame = Frame::from_bus(id, false, len, data);
         self.lengths.note(id, len);
         let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
-        Some((TraceRecord { time_ns, channel, event }, text.len() - rest.len()))
+        Some((TraceRecord { time_ns, device_ns: None, channel, event }, text.len() - rest.len()))
     }
 
     /// Whether a line without its end, which reads as `record`, lost a part of it. A complete log may lack the last line
@@ -203,7 +203,7 @@ impl Decoder {
             other => other,
         };
         let channel = self.interfaces.channel(interface);
-        Ok((TraceRecord { time_ns, channel, event }, second))
+        Ok((TraceRecord { time_ns, device_ns: None, channel, event }, second))
     }
 
     /// The same for a line of a list: `123#DEADBEEF`, with or without an interface or cansend before it.
@@ -213,7 +213,7 @@ impl Decoder {
         let (interface, frame) = untimed_parts(line).ok_or_else(malformed)?;
         let (event, second) = self.event(frame).ok_or_else(malformed)??;
         let channel = self.interfaces.channel(interface);
-        Ok((TraceRecord { time_ns: 0, channel, event }, second))
+        Ok((TraceRecord { time_ns: 0, device_ns: None, channel, event }, second))
     }
 
     /// What `123#DEADBEEF` is, as received; `None` without a `#`.

@@ -9,17 +9,24 @@ use super::super::left_out::LeftOut;
 use super::super::text::{self, NS_PER_S};
 use super::rows::{columns, push_time};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
-use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// The names of the columns.
-pub(super) const HEAD: &str = "time,channel,direction,type,id,dlc,data,event";
+pub(super) const HEAD: &str = "time,channel,direction,type,id,dlc,data,event,device_ns";
+/// Those of files that were written before there was the last one.
+pub(super) const HEAD_WITHOUT_DEVICE: &str = "time,channel,direction,type,id,dlc,data,event";
 
 /// Types of CAN FD frames, by their flags.
 const FD_KINDS: [&str; 4] = ["fd", "fd-brs", "fd-esi", "fd-brs-esi"];
 
-/// A row.
-pub(super) fn row(line: &[u8]) -> Result<TraceRecord, Fault> {
-    let [time, channel, direction, kind, id, dlc, data, event] = columns(line)?;
+/// A row, with the device's time or without that column.
+pub(super) fn row(line: &[u8], has_device: bool) -> Result<TraceRecord, Fault> {
+    let ([time, channel, direction, kind, id, dlc, data, event], device_ns) = if has_device {
+        let [time, channel, direction, kind, id, dlc, data, event, device_ns] = columns(line)?;
+        ([time, channel, direction, kind, id, dlc, data, event], device_time(device_ns)?)
+    } else {
+        (columns(line)?, None)
+    };
     let time_ns =
         text::time(time, NS_PER_S, b'.').ok_or_else(|| Fault::malformed("a time in seconds", time))?;
     let channel = text::decimal(channel)
@@ -30,7 +37,7 @@ pub(super) fn row(line: &[u8]) -> Result<TraceRecord, Fault> {
         let parsed = event_text.parse::<EventText>();
         let EventText(event) =
             parsed.map_err(|_| Fault::malformed("an event such as 'lost 5 queue'", event))?;
-        return Ok(TraceRecord { time_ns, channel, event });
+        return Ok(TraceRecord { time_ns, device_ns, channel, event });
     }
     let fd = FD_KINDS.iter().position(|known| known.as_bytes() == kind);
     let remote = match kind {
@@ -79,7 +86,16 @@ pub(super) fn row(line: &[u8]) -> Result<TraceRecord, Fault> {
     };
     let frame = frame.ok_or_else(wrong)?;
     let event = TraceEvent::Frame { frame, direction, late: event == b"late" };
-    Ok(TraceRecord { time_ns, channel, event })
+    Ok(TraceRecord { time_ns, device_ns, channel, event })
+}
+
+/// The device's time; empty where it is unknown.
+fn device_time(text: &[u8]) -> Result<Option<DeviceNs>, Fault> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let time = text::decimal(text).and_then(DeviceNs::new);
+    time.map(Some).ok_or_else(|| Fault::malformed("a device's time in nanoseconds, or none", text))
 }
 
 /// Writes the dialect.
@@ -118,10 +134,14 @@ impl Encode for Encoder {
                 for byte in frame.data() {
                     text::push_hex_byte(out, *byte);
                 }
-                out.extend_from_slice(if *late { b",late\n" } else { b",\n" });
+                out.extend_from_slice(if *late { b",late," } else { b",," });
             }
-            event => out.extend_from_slice(format!(",,event,,,,{}\n", EventText(*event)).as_bytes()),
+            event => out.extend_from_slice(format!(",,event,,,,{},", EventText(*event)).as_bytes()),
         }
+        if let Some(device_ns) = record.device_ns {
+            text::push_decimal(out, device_ns.get());
+        }
+        out.push(b'\n');
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {

@@ -96,7 +96,7 @@ pub(super) fn row(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fa
     let len = len.ok_or_else(|| Fault::malformed("a length", dlc))?;
     let message = Message { id: raw, extended, remote, error, len };
     let (event, second) = message.event(&bytes, error_frames)?;
-    Ok(Some((TraceRecord { time_ns, channel: 1, event }, second)))
+    Ok(Some((TraceRecord { time_ns, device_ns: None, channel: 1, event }, second)))
 }
 
 /// A time as Python writes a floating-point number: `1.5`, or for small numbers `9.7e-05`.

@@ -8,9 +8,9 @@ use super::super::event_text::EventText;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::part::{OPEN_COUNTERS, OPEN_LENGTH};
-use super::{BIT_ERROR, ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC, WORDS};
+use super::{BIT_ERROR, DEVICE_TIME, ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC, WORDS};
 use cantap_trace::fd::FD_MAX_BYTES;
-use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// What a stream or a compressed file lacks.
 pub(crate) const COUNTS_UNTOLD: &str = "the numbers of records in its head, which only a plain file can be given afterwards; it is marked as unfinished";
@@ -34,6 +34,12 @@ pub(super) type Part = (&'static str, u32, u8, u32, u8);
 const WORDS_BYTES: usize = 64;
 
 const TIME_BYTES: u32 = 8;
+
+/// Length of the device's time at the end of a record.
+const DEVICE_TIME_BYTES: u32 = 8;
+
+/// Records whose device's time has no place.
+const NO_DEVICE_TIME: &str = "the device's own times, because the first record has none";
 
 // Bits of the byte that begins with the direction.
 const EDL: u8 = 1 << 1;
@@ -111,6 +117,8 @@ pub(crate) struct Encoder {
     /// The file's header, up to the first record; empty before that.
     head: Vec<u8>,
     start_ns: i64,
+    /// Whether records end with the device's time: as the first one has it or not.
+    has_device_time: bool,
     /// The number of records of each kind, and its position in the header.
     counts: [u64; KINDS.len()],
     count_places: [usize; KINDS.len()],
@@ -168,7 +176,12 @@ impl Blocks {
 }
 
 impl Encoder {
-    fn begin(&mut self, first_ns: i64) {
+    /// The length of a record of this kind.
+    const fn bytes(&self, kind: &Kind) -> u32 {
+        kind.bytes + if self.has_device_time { DEVICE_TIME_BYTES } else { 0 }
+    }
+
+    fn begin(&mut self, first_ns: i64, has_device_time: bool) {
         const UTC: u8 = 2;
         const SOURCE_BUS: u8 = 2;
         const BUS_CAN: u8 = 2;
@@ -179,6 +192,7 @@ impl Encoder {
         const GROUP_BYTES: u64 = BLOCK_HEAD_BYTES as u64 + 4 * 8 + 8;
         // A date before 1970 cannot be expressed; times before the start can.
         self.start_ns = first_ns.max(0);
+        self.has_device_time = has_device_time;
         let mut blocks = Blocks(vec![0; HEADER_AT as usize + HEADER_BYTES]);
         let bus = blocks.text(*b"##TX", "CAN");
         let source = blocks.push(*b"##SI", &[bus, 0, 0], &[SOURCE_BUS, BUS_CAN, 0, 0, 0, 0, 0, 0]);
@@ -190,15 +204,21 @@ impl Encoder {
             data.extend_from_slice(&value.to_le_bytes());
         }
         let conversion = blocks.push(*b"##CC", &[0; 4], &data);
+        let nanoseconds = if has_device_time { blocks.text(*b"##TX", "ns") } else { 0 };
         let mut next_group = 0;
         for (at, kind) in KINDS.iter().enumerate().rev() {
             let mut next = 0;
+            if has_device_time {
+                let name = blocks.text(*b"##TX", &format!("{}.{DEVICE_TIME}", kind.name));
+                let part = ("", kind.bytes, 0, 8 * DEVICE_TIME_BYTES, UNSIGNED);
+                next = blocks.channel(0, name, [0, 0], &part, [0, 0, nanoseconds]);
+            }
             for part in kind.parts.iter().rev() {
                 let name = blocks.text(*b"##TX", &format!("{}.{}", kind.name, part.0));
                 next = blocks.channel(next, name, [0, 0], part, [0; 3]);
             }
             let name = blocks.text(*b"##TX", kind.name);
-            let all = ("", TIME_BYTES, 0, 8 * (kind.bytes - TIME_BYTES), BYTES);
+            let all = ("", TIME_BYTES, 0, 8 * (self.bytes(kind) - TIME_BYTES), BYTES);
             let frame = blocks.channel(0, name, [0, 0], &all, [next, 0, 0]);
             let stamp = ("", 0, 0, 8 * TIME_BYTES, SIGNED);
             let first = blocks.channel(frame, time, MASTER_OF_TIME, &stamp, [0, conversion, unit]);
@@ -208,7 +228,7 @@ impl Encoder {
             data.extend_from_slice(&BUS_EVENTS.to_le_bytes());
             data.extend_from_slice(&u16::from(b'.').to_le_bytes());
             data.extend_from_slice(&[0; 4]);
-            data.extend_from_slice(&kind.bytes.to_le_bytes());
+            data.extend_from_slice(&self.bytes(kind).to_le_bytes());
             data.extend_from_slice(&[0; 4]);
             let links = [next_group, first, name, source, 0, 0];
             next_group = blocks.push(*b"##CG", &links, &data);
@@ -243,9 +263,9 @@ impl Encoder {
 }
 
 impl Encode for Encoder {
-    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
         if self.head.is_empty() {
-            self.begin(record.time_ns);
+            self.begin(record.time_ns, record.device_ns.is_some());
             out.extend_from_slice(&self.head);
         }
         let mut begin = |kind: usize| {
@@ -295,11 +315,16 @@ impl Encode for Encoder {
                 out.resize(from + WORDS_BYTES, 0);
             }
         }
+        if self.has_device_time {
+            out.extend_from_slice(&DeviceNs::or_zero(record.device_ns).to_le_bytes());
+        } else if record.device_ns.is_some() {
+            left_out.note(NO_DEVICE_TIME);
+        }
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         if self.head.is_empty() {
-            self.begin(0);
+            self.begin(0, false);
             out.extend_from_slice(&self.head);
         }
     }
@@ -324,7 +349,8 @@ impl Encode for Encoder {
         let mut at = if bytes.starts_with(UNFINISHED_MAGIC) { self.head.len() } else { 0 };
         while let Some(number) = bytes.get(at) {
             let kind = usize::from(*number).checked_sub(1).and_then(|kind| KINDS.get(kind));
-            let Some(end) = kind.map(|kind| at + 1 + kind.bytes as usize).filter(|end| *end <= bytes.len())
+            let Some(end) =
+                kind.map(|kind| at + 1 + self.bytes(kind) as usize).filter(|end| *end <= bytes.len())
             else {
                 break;
             };
@@ -338,7 +364,8 @@ impl Encode for Encoder {
 mod tests {
     use super::super::super::tests;
     use crate::{Format, WriteOptions};
-    use cantap_trace::testing::{data_record, record_or_fd};
+    use cantap_trace::TraceRecord;
+    use cantap_trace::testing::{data_record, record_or_fd, with_device_time};
     use proptest::prelude::*;
 
     proptest! {
@@ -346,6 +373,25 @@ mod tests {
         #[test]
         fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1), 0..20)) {
             prop_assert_eq!(tests::round_trip(Format::Mf4, &records), records);
+        }
+
+        /// The first record decides whether there is a place for it.
+        #[test]
+        fn the_devices_time_is_kept_or_counted(
+            records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..20),
+        ) {
+            let options = WriteOptions { format: Some(Format::Mf4), ..WriteOptions::default() };
+            let (bytes, left_out) = tests::write_with(&options, &records);
+            let (read, issues) = tests::read(Format::Mf4, bytes);
+            prop_assert_eq!(issues, Vec::<String>::new());
+            let has_place = records.first().is_some_and(|first| first.device_ns.is_some());
+            let expected = records.iter().map(|record| {
+                TraceRecord { device_ns: record.device_ns.filter(|_| has_place), ..*record }
+            });
+            prop_assert_eq!(read, expected.collect::<Vec<_>>());
+            let missing = records.iter().filter(|record| record.device_ns.is_some() && !has_place).count();
+            let counted = left_out.iter().filter(|(what, _)| *what == super::NO_DEVICE_TIME);
+            prop_assert_eq!(counted.map(|(_, count)| count).sum::<u64>(), missing as u64);
         }
     }
 

@@ -107,6 +107,7 @@ pub(super) struct BusGroup {
     pub brs: Option<Number>,
     pub esi: Option<Number>,
     pub error_type: Option<Number>,
+    pub device_time: Option<Number>,
     pub words: Option<Field>,
 }
 
@@ -248,6 +249,7 @@ impl BusGroup {
         let brs = number("BRS", Meaning::Flag)?;
         let esi = number("ESI", Meaning::Flag)?;
         let error_type = number("ErrorType", Meaning::Number)?;
+        let device_time = number(super::DEVICE_TIME, Meaning::Number)?;
         let data_bytes = find("DataBytes");
         let bytes = match data_bytes {
             Some(channel) if channel.kind() == VARIABLE => {
@@ -290,6 +292,7 @@ impl BusGroup {
             brs,
             esi,
             error_type,
+            device_time,
             words,
         };
         group.is_complete = group.says_everything();

@@ -6,7 +6,7 @@ use super::super::issue::Fault;
 use super::ERROR_TYPES;
 use super::channel::{Number, Row, Validity};
 use super::layout::{BusGroup, Bytes, Events};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord};
 
 impl BusGroup {
     /// Whether its records alone say everything about their events.
@@ -52,7 +52,8 @@ impl BusGroup {
                 self.words(row.record).ok_or_else(fault)?
             }
         };
-        Ok(TraceRecord { time_ns, channel, event })
+        let device_time = self.device_time.as_ref().and_then(|number| number.get(row));
+        Ok(TraceRecord { time_ns, device_ns: device_time.and_then(DeviceNs::new), channel, event })
     }
 
     fn words(&self, record: &[u8]) -> Option<TraceEvent> {

@@ -11,12 +11,13 @@ use super::super::seek;
 use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, CUSTOM, CUSTOM_NOT_COPIED, DIRECTION, END, ENHANCED_PACKET,
-    EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_SPEED, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE,
-    NAME_RESOLUTION, OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER, SIMPLE_PACKET, STATISTICS,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, CUSTOM, CUSTOM_NOT_COPIED, DEVICE_NS_MAGIC, DIRECTION, END,
+    ENHANCED_PACKET, EPB_DEVICE_NS, EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_SPEED, IF_TSOFFSET, IF_TSRESOL,
+    INTERFACE_DESCRIPTION, LATE, NAME_RESOLUTION, OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER,
+    SIMPLE_PACKET, STATISTICS,
 };
 use cantap_can::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord};
 use serde::{Deserialize, Serialize};
 
 /// Longest block of a trace; far longer than a CAN packet.
@@ -359,18 +360,21 @@ impl Decoder {
         let Some(link) = interface.link else {
             return Ok(Found::LeftOut("packets that are not SocketCAN"));
         };
-        let (mut flags, mut dropped, mut is_late) = (0, 0, false);
+        let (mut flags, mut dropped, mut is_late, mut device_ns) = (0, 0, false, None);
         for (code, value) in fields.options(options) {
             match code {
                 EPB_FLAGS => flags = value.u32(0).unwrap_or(0),
                 EPB_DROPCOUNT => dropped = value.u64(0).unwrap_or(0),
+                EPB_DEVICE_NS if value.bytes.len() == 12 && value.bytes.starts_with(&DEVICE_NS_MAGIC) => {
+                    device_ns = value.u64(4).and_then(DeviceNs::new);
+                }
                 COMMENT => is_late |= value.bytes == LATE.as_bytes(),
                 _ => {}
             }
         }
         let named = link.interface(packet).map(|number| format!("interface {number}: "));
         let channel = named.map_or(interface.channel, |name| self.cooked.channel(name.as_bytes()));
-        let record = |event| TraceRecord { time_ns, channel, event };
+        let record = |event| TraceRecord { time_ns, device_ns, channel, event };
         let count = u32::try_from(dropped).unwrap_or(u32::MAX);
         let lost = record(TraceEvent::Lost { stage: None, count, at_least: u64::from(count) < dropped });
         match self.packets.read(link, packet, direction(flags)) {

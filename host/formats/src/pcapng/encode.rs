@@ -7,9 +7,9 @@ use super::super::left_out::LeftOut;
 use super::super::socketcan_packet::{EXTENDED, FD_PACKET_BYTES, LINK_TYPE, PACKET_BYTES, REMOTE};
 use super::super::writer::{ChannelInfo, WriteOptions};
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS,
-    IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION, ISB_IFDROP, ISB_IFRECV,
-    ISB_USRDELIV, LATE, OUTBOUND, SECTION_HEADER, SHB_USERAPPL, STATISTICS,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, DEVICE_NS_MAGIC, END, ENHANCED_PACKET, EPB_DEVICE_NS,
+    EPB_DROPCOUNT, EPB_FLAGS, IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION,
+    ISB_IFDROP, ISB_IFRECV, ISB_USRDELIV, LATE, OUTBOUND, SECTION_HEADER, SHB_USERAPPL, STATISTICS,
 };
 use cantap_can::LossStage;
 use cantap_trace::fd::FLAG_FDF;
@@ -259,6 +259,12 @@ impl Encode for Encoder {
             }
             if let Some(dropped) = dropped {
                 option(out, EPB_DROPCOUNT, &dropped.to_le_bytes());
+            }
+            if let Some(device_ns) = record.device_ns {
+                let mut value = [0; 12];
+                value[..4].copy_from_slice(&DEVICE_NS_MAGIC);
+                value[4..].copy_from_slice(&device_ns.get().to_le_bytes());
+                option(out, EPB_DEVICE_NS, &value);
             }
             if out.len() > before {
                 option(out, END, &[]);

@@ -85,7 +85,7 @@ impl Known {
         match content(kind, encoding, direction, bytes, &mut self.errors) {
             Ok(content) => {
                 let time_ns = content.time_ns.unwrap_or(stored_ns);
-                let record = |event| TraceRecord { time_ns, channel, event };
+                let record = |event| TraceRecord { time_ns, device_ns: None, channel, event };
                 self.errors.keep(content.second.map(record));
                 self.note = (direction == Direction::Tx).then_some(SENT_TOPIC);
                 Found::Record(record(content.event))

@@ -73,7 +73,9 @@ impl Bag {
         let content = content(kind, Encoding::Cdr, direction, bytes, errors)?;
         let time_ns = content.time_ns.unwrap_or(stored_ns);
         let events = std::iter::once(content.event).chain(content.second);
-        found.extend(events.map(|event| Found::Record(TraceRecord { time_ns, channel, event })));
+        found.extend(
+            events.map(|event| Found::Record(TraceRecord { time_ns, device_ns: None, channel, event })),
+        );
         if direction == Direction::Tx {
             found.push(Found::Note(SENT_TOPIC));
         }

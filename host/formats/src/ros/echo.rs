@@ -139,7 +139,7 @@ impl Decoder {
             None if !std::mem::replace(&mut self.noted_times, true) => self.notes.push(NO_TIMES),
             None => {}
         }
-        let record = TraceRecord { time_ns: self.time_ns, channel: 1, event: content.event };
+        let record = TraceRecord { time_ns: self.time_ns, device_ns: None, channel: 1, event: content.event };
         Ok(match content.second {
             Some(second) => Line::Two(record, second),
             None => Line::Record(record),

@@ -247,7 +247,7 @@ impl Decoder {
             let (brs, esi) = (matches!(kind, b"FB" | b"BI"), matches!(kind, b"FE" | b"BI"));
             let frame = flexible(id, brs, esi, len, layout.len_is_bytes, rest)?;
             let event = TraceEvent::Frame { frame, direction, late: false };
-            return Ok(Row::Record(TraceRecord { time_ns, channel, event }));
+            return Ok(Row::Record(TraceRecord { time_ns, device_ns: None, channel, event }));
         }
         let dlc = text::decimal(len)
             .filter(|dlc| *dlc <= 15)
@@ -271,7 +271,7 @@ impl Decoder {
         }
         let frame = Frame::from_bus(id, remote, dlc, data);
         let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
-        Ok(Row::Record(TraceRecord { time_ns, channel, event }))
+        Ok(Row::Record(TraceRecord { time_ns, device_ns: None, channel, event }))
     }
 
     /// A row that is not a frame. Those without interest yield nothing.
@@ -284,7 +284,7 @@ impl Decoder {
         told: Option<TraceRecord>,
     ) -> Result<Row, Fault> {
         if let Some(event) = event_text::marked(row) {
-            let record = TraceRecord { time_ns, channel: named_channel(row), event };
+            let record = TraceRecord { time_ns, device_ns: None, channel: named_channel(row), event };
             if self.version >= TrcVersion::V2_0 {
                 self.told = Some(record);
             }
@@ -320,7 +320,7 @@ impl Decoder {
             (b"EV", _) => return Ok(Row::LeftOut("comments and texts")),
             _ => return Err(wrong()),
         };
-        let record = TraceRecord { time_ns, channel, event };
+        let record = TraceRecord { time_ns, device_ns: None, channel, event };
         let same = |told: TraceRecord| {
             told.time_ns == time_ns
                 && std::mem::discriminant(&told.event) == std::mem::discriminant(&record.event)

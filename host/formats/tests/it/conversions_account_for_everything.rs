@@ -24,7 +24,7 @@ fn every_kind() -> Vec<TraceRecord> {
         |text: &str, direction| TraceEvent::Frame { frame: text.parse().unwrap(), direction, late: false };
     let mut push = |channel, event| {
         let time_ns = START_NS + STEP_NS * records.len() as i64;
-        records.push(TraceRecord { time_ns, channel, event });
+        records.push(TraceRecord { time_ns, device_ns: None, channel, event });
     };
     for channel in [1, 2, 0, 9, 255] {
         for text in [

@@ -24,6 +24,7 @@ fn frames() -> Vec<TraceRecord> {
         let channel = 1 + (at % 4 / 2) as u8;
         records.push(TraceRecord {
             time_ns: 1_410_714_882_000_000_000 + at as i64 * 125_000,
+            device_ns: None,
             channel,
             event,
         });

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_formats::{CsvDialect, Format};
-use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
 use traces::{directory, file_name, read, write};
 
 const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/formats.md");
@@ -22,7 +22,7 @@ fn frame(text: &str, direction: Direction) -> TraceEvent {
 }
 
 fn alone(event: TraceEvent, channel: u8) -> TraceRecord {
-    TraceRecord { time_ns: TIME_NS, channel, event }
+    TraceRecord { time_ns: TIME_NS, device_ns: None, channel, event }
 }
 
 /// What is read back of a record after an ordinary frame, or of that frame.
@@ -33,6 +33,13 @@ fn back(format: Format, record: TraceRecord) -> Option<TraceRecord> {
     let (records, issues) = read(&path);
     assert_eq!(issues, Vec::<String>::new(), "{format}");
     records.into_iter().nth(1)
+}
+
+/// What is read back of a file's only record.
+fn first_back(format: Format, record: TraceRecord) -> TraceRecord {
+    let path = directory("formats_page").join(file_name(format, ""));
+    write(&path, format, &[record]);
+    read(&path).0[0]
 }
 
 fn row(format: Format) -> String {
@@ -70,13 +77,13 @@ fn row(format: Format) -> String {
             // The crate of columns writes it, for the command.
             Format::Parquet => {
                 return format!(
-                    "| {format} | read, written | 1 ns | yes | yes | yes | yes | yes | yes | yes |"
+                    "| {format} | read, written | 1 ns | yes | yes | yes | yes | yes | yes | yes | yes |"
                 );
             }
             Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),
         };
-        return format!("| {format} | read | {times} | {rest} |");
+        return format!("| {format} | read | {times} | {rest} | – |");
     }
     let step_ns = [1, 1000, 100_000, 1_000_000].into_iter().find(|step_ns| {
         let record = alone(frame("123#11", Direction::Rx), 1);
@@ -133,9 +140,12 @@ fn row(format: Format) -> String {
         Some(TraceEvent::Lost { .. }) => "that there was one",
         _ => "–",
     };
+    let stamped = alone(frame("123#11", Direction::Rx), 1);
+    let stamped = TraceRecord { device_ns: DeviceNs::new(7_000_083), ..stamped };
+    let of_device = if first_back(format, stamped).device_ns == stamped.device_ns { "yes" } else { "–" };
     let times = if local { format!("{times}, local") } else { times.to_owned() };
     format!(
-        "| {format} | read, written | {times} | {channel} | {direction} | {remote} | {fd} | {errors} | {states} | {losses} |"
+        "| {format} | read, written | {times} | {channel} | {direction} | {remote} | {fd} | {errors} | {states} | {losses} | {of_device} |"
     )
 }
 

@@ -84,6 +84,7 @@ fn a_long_file_comes_back_whole_and_its_content_shows_its_format() {
     let path = directory("parquet_long").join("a.bin");
     let record = |at: i64| TraceRecord {
         time_ns: at * 1000,
+        device_ns: None,
         channel: (at % 3) as u8,
         event: cantap_trace::TraceEvent::Frame {
             frame: format!("{:03X}#{at:08X}", at % 2048).parse().unwrap(),
@@ -185,6 +186,7 @@ fn decoded_values_are_counted_and_not_taken_for_frames() {
     let mut values = Vec::new();
     let frame = TraceRecord {
         time_ns: 1,
+        device_ns: None,
         channel: 1,
         event: cantap_trace::TraceEvent::Frame {
             frame: "123#11".parse().unwrap(),
@@ -227,7 +229,7 @@ fn sample(at: i64) -> TraceRecord {
     let frame = format!("{:03X}#{at:04X}", at % 2048).parse().unwrap();
     let event =
         cantap_trace::TraceEvent::Frame { frame, direction: cantap_trace::Direction::Tx, late: false };
-    TraceRecord { time_ns: at, channel: 2, event }
+    TraceRecord { time_ns: at, device_ns: None, channel: 2, event }
 }
 
 /// The crate that reads Parquet is written for files of friends.

@@ -335,7 +335,7 @@ fn wireshark_shows_losses_as_drop_counts_with_words_and_sent_frames_as_outbound(
     let frame = |direction| TraceEvent::Frame { frame: "123#11".parse().unwrap(), direction, late: false };
     let lost = |count| TraceEvent::Lost { stage: Some(LossStage::Queue), count, at_least: false };
     let events = [(1, frame(Direction::Rx)), (2, lost(42)), (1, frame(Direction::Tx)), (2, lost(1))];
-    let records = events.map(|(channel, event)| TraceRecord { time_ns: 5, channel, event });
+    let records = events.map(|(channel, event)| TraceRecord { time_ns: 5, device_ns: None, channel, event });
     write(&path, Format::Pcapng, &records);
     let mut command = Command::new("tshark");
     command.arg("-r").arg(&path).args(["-T", "fields", "-E", "separator=|"]);

@@ -107,6 +107,7 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table_and_in_pcapng() {
         TraceEvent::Frame { frame: "123#DEADBEEF".parse().unwrap(), direction: Direction::Tx, late: true };
     let records = [-1, 0, i64::from(u32::MAX) * 1_000_000_001].map(|time_ns| TraceRecord {
         time_ns,
+        device_ns: None,
         channel: 255,
         event,
     });

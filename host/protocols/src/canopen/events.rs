@@ -8,7 +8,7 @@ use crate::{Event, EventKind, Field, Protocol, Trouble};
 
 /// A record without a frame, for events that no frame causes.
 pub const fn nothing(channel: u8) -> TraceRecord {
-    TraceRecord { time_ns: 0, channel, event: TraceEvent::GAP }
+    TraceRecord { time_ns: 0, device_ns: None, channel, event: TraceEvent::GAP }
 }
 
 pub fn event(record: &TraceRecord, kind: EventKind, title: impl Into<Cow<'static, str>>) -> Event {

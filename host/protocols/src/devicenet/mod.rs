@@ -353,7 +353,12 @@ fn allocation(choice: u8) -> String {
 }
 
 fn unanswered(channel: u8, server: u8, asked: Message, trouble: Trouble) -> Event {
-    let record = TraceRecord { time_ns: asked.time_ns, channel, event: cantap_trace::TraceEvent::GAP };
+    let record = TraceRecord {
+        time_ns: asked.time_ns,
+        device_ns: None,
+        channel,
+        event: cantap_trace::TraceEvent::GAP,
+    };
     let mut event = service_event(&record, EventKind::NoResponse, &asked.body, true);
     (event.from, event.to) = parties(server, asked.other, false);
     event.start_ns = asked.start_ns;
@@ -395,6 +400,7 @@ impl Assembler for DeviceNet {
                 if let Some(message) = open.take() {
                     let record = TraceRecord {
                         time_ns: message.time_ns,
+                        device_ns: None,
                         channel,
                         event: cantap_trace::TraceEvent::GAP,
                     };

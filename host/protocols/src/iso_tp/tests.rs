@@ -139,7 +139,7 @@ fn fd_frames_carry_more() {
     let fd = |ms: f64, id: u32, bytes: &[u8]| {
         let frame = TraceFrame::Fd(FdFrame::new(Id::standard(id).unwrap(), true, false, bytes).unwrap());
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: (ms * 1e6) as i64, channel: 1, event }
+        TraceRecord { time_ns: (ms * 1e6) as i64, device_ns: None, channel: 1, event }
     };
     let mut single = vec![0x00, 0x16];
     single.extend(1..=22);
@@ -245,7 +245,7 @@ fn a_short_frame_in_the_middle_is_not_glued_over() {
     let fd = |ms: i64, bytes: Vec<u8>| {
         let frame = FdFrame::new(Id::standard_truncated(0x7E8), true, false, &bytes).unwrap();
         let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-        TraceRecord { time_ns: ms * 1_000_000, channel: 1, event }
+        TraceRecord { time_ns: ms * 1_000_000, device_ns: None, channel: 1, event }
     };
     let first = [&[0x10, 100][..], &[1; 62]].concat();
     let whole = transfers(&[], &[fd(0, first.clone()), fd(1, [&[0x21][..], &[2; 47]].concat())]);

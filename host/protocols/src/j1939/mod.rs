@@ -429,7 +429,8 @@ impl Assembler for J1939 {
         let mut messages = Vec::new();
         self.transport.finish(&mut |message| messages.push(message));
         self.marine.finish(&mut |message| messages.push(message));
-        let record = TraceRecord { time_ns: 0, channel: 1, event: cantap_trace::TraceEvent::GAP };
+        let record =
+            TraceRecord { time_ns: 0, device_ns: None, channel: 1, event: cantap_trace::TraceEvent::GAP };
         for message in messages {
             self.assembled(&record, message, events);
         }

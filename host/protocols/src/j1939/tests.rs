@@ -219,7 +219,7 @@ fn any_frames_are_taken() {
             let _ = event.to_string();
         }
     }
-    let gap = cantap_trace::TraceRecord { time_ns: 0, channel: 1, event: TraceEvent::GAP };
+    let gap = cantap_trace::TraceRecord { time_ns: 0, device_ns: None, channel: 1, event: TraceEvent::GAP };
     assembler.take(&gap, &mut events);
     assembler.finish(&mut events);
 }

@@ -29,7 +29,7 @@ fn peer(module: &str, arguments: &[&str]) -> Option<String> {
 
 fn record(time_ns: i64, frame: &str) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns, channel: 1, event }
+    TraceRecord { time_ns, device_ns: None, channel: 1, event }
 }
 
 /// The frames printed by a talk, and what was said.

@@ -95,7 +95,10 @@ fn events(frames: &[TraceFrame], protocol: Protocol) -> Vec<Vec<Event>> {
     let take = |(at, frame): (usize, &TraceFrame)| {
         let event = TraceEvent::Frame { frame: *frame, direction: Direction::Rx, late: false };
         let mut events = Vec::new();
-        reader.push(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event }, &mut events);
+        reader.push(
+            &TraceRecord { time_ns: at as i64 * 1_000_000, device_ns: None, channel: 1, event },
+            &mut events,
+        );
         events
     };
     frames.iter().enumerate().map(take).collect()

@@ -173,7 +173,7 @@ fn check(name: &str, bus: &Bus) {
         .map(|(us, frame)| {
             let event =
                 TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-            TraceRecord { time_ns: *us as i64 * 1000, channel: 1, event }
+            TraceRecord { time_ns: *us as i64 * 1000, device_ns: None, channel: 1, event }
         })
         .collect();
     let (mut text, mut overview) = (String::new(), Overview::default());

@@ -135,7 +135,7 @@ fn event(message: &str, time_ns: i64) -> Event {
     let protocols = vec![Protocol::IsoTp, Protocol::Uds, Protocol::Kwp2000, Protocol::Obd];
     let mut reader = Reader::new(Options { protocols, ..Options::default() });
     let mut events = Vec::new();
-    reader.push(&TraceRecord { time_ns, channel: 1, event }, &mut events);
+    reader.push(&TraceRecord { time_ns, device_ns: None, channel: 1, event }, &mut events);
     reader.finish(&mut events);
     let said: Vec<_> = events.iter().map(ToString::to_string).collect();
     assert_eq!(events.len(), 1, "{message}: {said:?}");

@@ -161,7 +161,7 @@ impl ScriptThread {
         let (time_ns, missed) = (first.time_ns, std::mem::take(&mut self.missed));
         for (channel, count) in Channel::ALL.into_iter().zip(missed).filter(|(_, count)| *count > 0) {
             let event = TraceEvent::Lost { stage: None, count, at_least: false };
-            batch.insert(0, TraceRecord { time_ns, channel: channel.number(), event });
+            batch.insert(0, TraceRecord { time_ns, device_ns: None, channel: channel.number(), event });
         }
         self.shared.backlog.fetch_add(batch.len(), Ordering::Relaxed);
         self.pass(ToScripts::Records(batch));

@@ -16,7 +16,7 @@ fn record(at_ns: u64, text: &str) -> TraceRecord {
 
 fn of_frame(at_ns: u64, frame: Frame) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns: at_ns as i64, channel: 1, event }
+    TraceRecord { time_ns: at_ns as i64, device_ns: None, channel: 1, event }
 }
 
 fn observe(records: &[TraceRecord]) -> Observed {
@@ -317,6 +317,7 @@ fn strange_traces_have_scripts_that_run() {
         .collect();
     let lost = |number: u64| TraceRecord {
         time_ns: (number * 10_000_000) as i64,
+        device_ns: None,
         channel: 1,
         event: TraceEvent::Lost { stage: None, count: 1, at_least: true },
     };

@@ -159,6 +159,7 @@ mod tests {
         let frame = frame.parse::<Frame>().unwrap().into();
         TraceRecord {
             time_ns: ms * 1_000_000,
+            device_ns: None,
             channel: 1,
             event: TraceEvent::Frame { frame, direction, late: false },
         }

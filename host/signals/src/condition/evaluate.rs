@@ -230,7 +230,7 @@ mod tests {
     }
 
     fn record(event: TraceEvent) -> TraceRecord {
-        TraceRecord { time_ns: 0, channel: 1, event }
+        TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }
     }
 
     fn frame(text: &str) -> TraceRecord {

@@ -78,6 +78,7 @@ fn its_signals_are_named_with_their_pdu_where_that_is_wanted() {
     let mut decoder = decoder(FILE);
     let record = |frame: &str| TraceRecord {
         time_ns: 0,
+        device_ns: None,
         channel: 1,
         event: TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false },
     };

@@ -87,7 +87,7 @@ fn a_parameter_that_is_not_there_is_no_value() {
 
 fn record(frame: &str) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns: 0, channel: 1, event }
+    TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }
 }
 
 const GEARS: &str = "BO_ 5 Box: 2 A\n SG_ Gear : 0|8@1- (1,0) [0|0] \"\" A\n SG_ Alarm : 8|8@1+ (1,0) [0|0] \"\" A\n\
@@ -357,5 +357,5 @@ fn fd_frames_decode_as_far_as_they_reach() {
     let mut condition = Condition::new("byte[63] == 63 and Wide == 205.7", &decoder).unwrap();
     let frame: TraceFrame = format!("005##0{}", data(64)).parse().unwrap();
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-    assert!(condition.holds(&TraceRecord { time_ns: 0, channel: 1, event }));
+    assert!(condition.holds(&TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }));
 }

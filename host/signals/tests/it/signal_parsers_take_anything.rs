@@ -185,7 +185,7 @@ proptest! {
         let frame = Frame::data_frame("001".parse().unwrap(), &frame).unwrap().into();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
         match Condition::new(&text, &decoder) {
-            Ok(mut condition) => { condition.holds(&TraceRecord { time_ns: 0, channel: 1, event }); }
+            Ok(mut condition) => { condition.holds(&TraceRecord { time_ns: 0, device_ns: None, channel: 1, event }); }
             Err(error) => prop_assert!(error.to_string().lines().count() == 3, "{}", error),
         }
         let _ = (text.parse::<IdPattern>(), text.parse::<DataPattern>(), encode::encode(&decoder, None, &text));

@@ -2,6 +2,8 @@
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
+use cantap_trace::DeviceNs;
+
 /// Time by a device's stamp timer: ticks since it started, at the rate that `Hello` gives.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Ticks(pub u64);
@@ -10,6 +12,15 @@ impl Ticks {
     /// Ticks from `other` to this time.
     pub const fn since(self, other: Self) -> i64 {
         self.0.wrapping_sub(other.0) as i64
+    }
+
+    /// The time in nanoseconds, rounded down; `None` for tick 0, which stands for a time that is not known, and for one beyond 584 years.
+    #[inline]
+    pub fn device_ns(self, tick_hz: u32) -> Option<DeviceNs> {
+        const NS_PER_S: u64 = 1_000_000_000;
+        let hz = u64::from(tick_hz.max(1));
+        let part_ns = self.0 % hz * NS_PER_S / hz;
+        DeviceNs::new((self.0 / hz).checked_mul(NS_PER_S)?.checked_add(part_ns)?)
     }
 
     /// This time plus a number of ticks.

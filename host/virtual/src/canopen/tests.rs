@@ -27,7 +27,7 @@ impl Bus {
 
     fn note(&mut self, frame: &Frame) {
         let event = TraceEvent::Frame { frame: (*frame).into(), direction: Direction::Rx, late: false };
-        self.records.push(TraceRecord { time_ns: self.now_ns as i64, channel: 1, event });
+        self.records.push(TraceRecord { time_ns: self.now_ns as i64, device_ns: None, channel: 1, event });
     }
 
     /// Lets time pass.

@@ -28,7 +28,7 @@ impl Sent {
     /// As a trace has it.
     pub fn record(&self) -> TraceRecord {
         let event = TraceEvent::Frame { frame: self.frame.into(), direction: Direction::Tx, late: false };
-        TraceRecord { time_ns: self.time_ns, channel: self.channel.number(), event }
+        TraceRecord { time_ns: self.time_ns, device_ns: None, channel: self.channel.number(), event }
     }
 }
 

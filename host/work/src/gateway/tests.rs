@@ -18,7 +18,7 @@ fn error(text: &str) -> String {
 
 fn on(channel: u8, time_ns: i64, frame: &str) -> TraceRecord {
     let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
-    TraceRecord { time_ns, channel, event }
+    TraceRecord { time_ns, device_ns: None, channel, event }
 }
 
 fn dry_run(rules: &Rules, records: &[TraceRecord]) -> (Vec<Sent>, DryRunCounts) {

@@ -74,7 +74,7 @@ fn silence_is_said_and_a_loss_meanwhile_too() {
     let all = events(&[at(0.0, "7E0#023E00"), at(2500.0, "123#")]);
     assert_eq!((all[0].kind, all[0].time_ns), (EventKind::NoResponse, 2_000_000_000));
     assert_eq!(all[0].trouble, Some(Trouble::Timeout { after_ms: 2000 }));
-    let gap = TraceRecord { time_ns: 1_000_000, channel: 1, event: TraceEvent::GAP };
+    let gap = TraceRecord { time_ns: 1_000_000, device_ns: None, channel: 1, event: TraceEvent::GAP };
     let all = events(&[at(0.0, "7E0#023E00"), gap, at(2500.0, "123#")]);
     assert!(all[0].frames_lost, "{all:?}");
     let all = events(&[at(0.0, "7E0#023E00"), at(10.0, "7E0#021001"), at(11.0, "7E8#025001")]);

@@ -18,7 +18,7 @@ const MAX_TIME: Duration = Duration::from_secs(5);
 /// The deepest nesting of calls; each takes space on the thread's stack.
 const MAX_CALLS: usize = 48;
 /// Values in an array with everything in it.
-const MAX_ARRAY: usize = 1 << 20;
+const MAX_ARRAY: usize = 1 << 19;
 /// Entries in a map with everything in it.
 const MAX_MAP: usize = 1 << 16;
 /// Bytes of a text, or of all texts in an array or a map.

@@ -8,8 +8,9 @@ use cantap_trace::{LossStage, TraceEvent, TraceRecord, packed};
 
 /// Most bytes of packed records: minutes of two saturated buses.
 const MOST_BYTES: usize = 64 << 20;
-/// What a chunk takes besides its records.
-const CHUNK_BYTES: usize = 128;
+/// What a chunk takes besides its records: its places in the ring, itself, the head of its records and the counts before it, each with what
+/// the allocator takes.
+const CHUNK_BYTES: usize = 16 + (size_of::<Chunk>() + 16) + (16 + 16) + (2 * size_of::<(u8, u64)>() + 16);
 
 /// Frames of each channel, by its number.
 type Frames = Vec<(u8, u64)>;
@@ -22,7 +23,8 @@ pub struct Backlog {
 
 #[derive(Default)]
 struct State {
-    chunks: VecDeque<Chunk>,
+    /// Boxed: a ring grows to twice its size at once, and that is then little.
+    chunks: VecDeque<Box<Chunk>>,
     bytes: usize,
     /// The number of records so far.
     next: u64,
@@ -107,7 +109,7 @@ impl Backlog {
         };
         state.next = chunk.next;
         state.bytes += chunk.packed.len() + CHUNK_BYTES;
-        state.chunks.push_back(chunk);
+        state.chunks.push_back(Box::new(chunk));
         while state.bytes > self.most_bytes && state.chunks.len() > 1 {
             let Some(oldest) = state.chunks.pop_front() else { return };
             state.bytes -= oldest.packed.len() + CHUNK_BYTES;
@@ -121,7 +123,7 @@ impl Backlog {
             // Whoever comes back with a number of the future has it from elsewhere.
             let from = state.chunks.partition_point(|chunk| chunk.next <= cursor.next);
             let mut bytes = 0;
-            let fits = |chunk: &&Chunk| {
+            let fits = |chunk: &&Box<Chunk>| {
                 let is_first = bytes == 0;
                 bytes += chunk.packed.len() + 4;
                 is_first || bytes <= most_bytes

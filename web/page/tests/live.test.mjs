@@ -297,7 +297,7 @@ test('a device that goes away and comes back leaves a gap and a whole recording,
     await page.locator('#live-record').click();
     await until(page, 'the recording grows', () => /all\.blf: .*, \d.* records/.test(document.querySelector('#view-device').textContent));
     await board.stop();
-    await untilText(page, '#view-device', 'away');
+    await untilText(page, '#view-device', 'gone');
     await untilText(page, '.notices', 'it continues when the device is back');
     board = await boardAt(socket);
     await untilText(page, '#view-device', ': connected');

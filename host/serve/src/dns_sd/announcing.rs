@@ -1,7 +1,7 @@
 //! Announces listeners, and answers for them, until they are no longer there.
 
 use std::io;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -42,7 +42,7 @@ pub(super) fn announce_on(network: Network, listeners: &[Listener]) -> io::Resul
         // The zone of an IPv6 address is in the listener's.
         let address = listeners.iter().find(|listener| place(listener) == at).map_or(at, |one| one.address);
         let speaker = Link::of(address)?.listening(network)?;
-        let host = host_label();
+        let host = host_label(at.ip());
         let responder = Responder::new(kind_name(), at.ip(), &host, &services, text(), Instant::now());
         let is_over = Arc::clone(&announcing.is_over);
         let thread = std::thread::Builder::new().name("cantap-dns-sd".to_owned());
@@ -59,11 +59,12 @@ pub(super) fn service(listener: &Listener) -> Service {
     Service { label: format!("cantap{serial}{place}"), port: listener.address.port() }
 }
 
-/// A host's name of its own: the computer's may be announced by the system, with other addresses.
-fn host_label() -> String {
+/// A host's name of its own: the computer's may be announced by the system, with other addresses. A listener has one address, so that the other
+/// kind has another name.
+pub(super) fn host_label(ip: IpAddr) -> String {
     let is_plain = |letter: &char| letter.is_ascii_alphanumeric() || *letter == '-';
     let plain: String = host_name().unwrap_or_default().chars().filter(is_plain).take(40).collect();
-    format!("cantap-{plain}")
+    format!("cantap{}-{plain}", if ip.is_ipv6() { "6" } else { "" })
 }
 
 fn run(

@@ -99,11 +99,11 @@ fn found_while(packets: Vec<Vec<u8>>, enough: impl Fn(&Browsed) -> bool) -> Brow
     found(network, enough)
 }
 
-/// What is found, asking as often as it takes on a busy computer.
+/// What is found, asking as often and as long as it takes on a busy computer.
 fn found(network: Network, enough: impl Fn(&Browsed) -> bool) -> Browsed {
     let mut browsed = Browsed::default();
-    for _ in 0..20 {
-        browsed = browse_on(network, Duration::from_secs(1)).unwrap();
+    for seconds in 1..20 {
+        browsed = browse_on(network, Duration::from_secs(seconds)).unwrap();
         if enough(&browsed) {
             break;
         }
@@ -130,6 +130,13 @@ fn servers_that_are_announced_are_found_with_their_serial_numbers() {
     assert!(found.servers[0].name.starts_with("cantap 0042.A\\B"), "{found:?}");
     drop(announcing);
     assert_eq!(browse_on(network, Duration::from_secs(1)).unwrap(), Browsed::default());
+}
+
+/// A listener of IPv6 is not at the address of IPv4 that the host's other name has.
+#[test]
+fn each_kind_of_address_has_a_host_s_name_of_its_own() {
+    let six: IpAddr = "fd00::2".parse().unwrap();
+    assert_ne!(announcing::host_label(HERE), announcing::host_label(six));
 }
 
 /// Another computer has the names already, and says so when they are tried.

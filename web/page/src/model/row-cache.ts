@@ -25,13 +25,19 @@ export class RowCache {
     return this.#latest.busy;
   }
 
-  /** Another view, or the same one grown: rows that were whole stay. */
+  /** Another view, or with `keep` the same one grown: then rows stay, and so do those that are on their way. */
   set(view: number, length: number, keep: boolean): void {
-    if (!keep) this.#blocks.clear();
-    else for (const [number, rows] of this.#blocks) if (rows.length < BLOCK) this.#blocks.delete(number);
+    if (!keep) {
+      this.#blocks.clear();
+      this.#generation++;
+    }
     this.view = view;
     this.length = length;
-    this.#generation++;
+  }
+
+  /** Whether a block has all rows that there are by now. */
+  #isWhole(block: number): boolean {
+    return (this.#blocks.get(block)?.length ?? -1) >= Math.min(BLOCK, this.length - block * BLOCK);
   }
 
   get(index: number): Row | null {
@@ -40,7 +46,7 @@ export class RowCache {
 
   want(from: number, to: number): void {
     for (let block = Math.floor(from / BLOCK); block * BLOCK < to; block++) {
-      if (!this.#blocks.has(block)) {
+      if (!this.#isWhole(block)) {
         this.#latest.ask({ from, to });
         return;
       }
@@ -55,7 +61,7 @@ export class RowCache {
   async #fetch({ from, to }: { from: number; to: number }): Promise<void> {
     const generation = this.#generation;
     for (let block = Math.floor(from / BLOCK); block * BLOCK < Math.min(to, this.length); block++) {
-      if (this.#blocks.has(block)) continue;
+      if (this.#isWhole(block)) continue;
       const rows = await this.app.ask('rows', { view: this.view, from: block * BLOCK, count: BLOCK });
       if (generation !== this.#generation) return;
       this.#blocks.set(block, rows);

@@ -50,10 +50,13 @@ impl Origin {
         Self(match ip.to_canonical() {
             ip if ip.is_loopback() => None,
             IpAddr::V6(ip) => Some(IpAddr::V6(Ipv6Addr::from_bits(ip.to_bits() & u128::MAX << 64))),
-            ip => Some(ip),
+            IpAddr::V4(ip) => Some(IpAddr::V4(ip)),
         })
     }
 }
+
+/// Whether a seat counts against a limit.
+type Counts<'a> = &'a dyn Fn(&Seat) -> bool;
 
 /// What a peer has shown of itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -101,7 +104,7 @@ impl Places {
         let of_one = |seat: &Seat| seat.from == from;
         let of_others = |seat: &Seat| seat.from != Origin::HERE;
         let of_all = |_: &Seat| true;
-        let limits: [(usize, &dyn Fn(&Seat) -> bool, NoPlace); 3] = [
+        let limits: [(usize, Counts<'_>, NoPlace); 3] = [
             (self.most_from_one, &of_one, NoPlace::FromOne(self.most_from_one)),
             (self.most_from_others, &of_others, NoPlace::FromOthers(self.most_from_others)),
             (self.most, &of_all, NoPlace::Full(self.most)),

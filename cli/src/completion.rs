@@ -15,7 +15,7 @@ use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathComplete
 use crate::shells;
 
 /// Suffixes of databases.
-const DATABASES: [&str; 5] = ["dbc", "kcd", "sym", "arxml", "toml"];
+const DATABASES: [&str; 7] = ["dbc", "kcd", "sym", "arxml", "toml", "xlsx", "csv"];
 
 /// Device addresses: connected boards, and devices that need none.
 pub fn devices() -> ArgValueCompleter {

@@ -389,10 +389,11 @@ impl Drop for Temporary {
     }
 }
 
-/// Whether a file's name is that of a trace. Tables of decoded signals end in `.parquet`, too: such a file is only read if it is named itself.
+/// Whether a file's name is that of a trace. Tables of decoded signals end in `.parquet`, too, and much else does in `.json`: such a file is only read if
+/// it is named itself.
 #[pyfunction]
 fn is_trace_name(name: PathBuf) -> bool {
-    Format::of_path(&name).is_ok_and(|format| format != Format::Parquet)
+    Format::of_path(&name).is_ok_and(|format| !matches!(format, Format::Parquet | Format::Json))
 }
 
 /// Adds the functions to the module.

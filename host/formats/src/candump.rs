@@ -81,6 +81,17 @@ mod tests {
         assert_eq!(issues.len(), 2, "{issues:?}");
     }
 
+    /// As people's scripts print times since the start.
+    #[test]
+    fn times_with_blanks_before_them_are_read() {
+        let (records, issues) = tests::read(
+            Format::Candump,
+            "(         0.191254) can0 123#11\n(        10.200196) can0 06314000#\n",
+        );
+        assert_eq!((records.len(), issues), (2, vec![]));
+        assert_eq!(records[1].time_ns, 10_200_196_000);
+    }
+
     #[test]
     fn a_time_beyond_nanoseconds_is_refused_and_not_wrapped() {
         let (records, issues) = tests::read(Format::Candump, "(9999999999.000000) can0 123#11\n");

@@ -134,8 +134,10 @@ impl RowFormat for Decoder {
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let line = plain(line);
         // The explanation of an error frame (-e) is on the lines below it.
-        // Comments are those of the people who kept it.
-        if line.is_empty() || line.starts_with(b"\t") || line.starts_with(b"#") || is_command(&line) {
+        // Comments are those of the people who kept it, and `--` is what grep writes between parts.
+        let is_other =
+            line.starts_with(b"\t") || line.trim_ascii_start().starts_with(b"#") || *line == *b"--";
+        if line.is_empty() || is_other || is_command(&line) {
             return Ok(Line::Nothing);
         }
         let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", &line);
@@ -249,6 +251,15 @@ mod tests {
 
     fn as_log(screen: &str) -> (String, Vec<String>) {
         tests::as_log(Format::CandumpScreen, screen)
+    }
+
+    /// As `candump can0 | grep -A1 7DF` leaves them, with comments of the people who kept them.
+    #[test]
+    fn what_grep_puts_between_parts_is_no_fault() {
+        let (log, issues) = as_log("--\n  # answers\n  can0  7DF   [2]  01 00\n--\n  can0  7E8   [1]  02\n");
+        assert_eq!((log.lines().count(), issues), (2, vec![]));
+        let file = b"--\n  can0  7DF   [2]  01 00\n";
+        assert_eq!(Format::of_content(file), Some(Format::CandumpScreen));
     }
 
     #[test]

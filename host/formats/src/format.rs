@@ -69,4 +69,6 @@ pub enum Format {
     RosBag,
     /// A table in Parquet: a row for each record, or frames in any columns.
     Parquet,
+    /// A JSON object for each frame.
+    Json,
 }

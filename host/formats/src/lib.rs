@@ -44,6 +44,7 @@ mod gvret;
 mod input;
 mod interfaces;
 mod issue;
+mod json;
 mod kvaser;
 mod labelled;
 mod left_out;

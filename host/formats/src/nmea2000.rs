@@ -3,10 +3,16 @@
 //! * Yacht Devices' RAW, `00:29:58.617 R 0DFF180D A2 8C 50 C0 FF FF FF FF`: every frame as it was.
 //! * canboat's plain form, `2011-11-24-22:42:04.388,2,127250,36,255,8,ff,10,…`: time, priority, PGN, source, destination, length and bytes.
 //! * Actisense's N2K ASCII, `A000159.990 CCFF7 0FF63 3B9F0000000002FF`: time of day, source, destination and priority, PGN, bytes.
+//! * The NMEA2000 library of T. Lappalainen, for boards: `228437 : Pri:2 PGN:130306 Source:105 Dest:255 Len:8 Data:0,F6,0,FB,96,FA,FF,FF`, milliseconds since
+//!   the board started.
+//! * NMEA 0183 sentences of several makers, in `sentence.rs`.
 //!
 //! Signal K's log of what came in has such lines, each behind a time and the name of its source: `1555009219000;ydgw;00:29:58.617 R …`.
 //!
 //! Some gateways put fast packets together before they print them. The frames that those were are not in the file, so they are counted and left out.
+
+mod message;
+mod sentence;
 
 use super::calendar::NS_PER_DAY;
 use super::frame_fields::{FrameFields, Payload, hex_byte, identifier};
@@ -16,12 +22,25 @@ use super::table::date;
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
 use cantap_trace::{Direction, TraceRecord};
+use message::{Form, Message, Time, id};
+use sentence::{Habits, Sentence};
 
 const EXPECTED: &str = "a line of an NMEA 2000 gateway such as '00:29:58.617 R 0DFF180D A2 8C', \
-                        '2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10' or 'A000159.990 CCFF7 0FF63 3B9F'";
+                        '2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10', 'A000159.990 CCFF7 0FF63 3B9F' or \
+                        '$PCDIN,01F119,00000000,0F,2AAF00D1067414FF*59'";
 const PUT_TOGETHER: &str = "NMEA 2000 messages that their gateway put together from several frames";
 const OF_ANOTHER_SOURCE: &str = "lines of Signal K's log that are of no NMEA 2000 gateway";
 const OF_THE_GATEWAY: &str = "messages of the gateway itself";
+const OTHER_SENTENCES: &str = "NMEA 0183 sentences that carry no NMEA 2000";
+const TO_GATEWAY: &str = "sentences to a gateway, which sends them with an address of its own";
+const SENTENCE: &str = "a whole NMEA 0183 sentence with a right checksum";
+const NO_TIMES: &str =
+    "nothing shows when the frames of $MXPGN were on the bus: they stand at the last time that was, or at 0";
+const TIMES_OF_FIXES: &str =
+    "$MXPGN has no times: its frames stand at that of the last position before them (RMC, ZDA)";
+const ORDER_UNKNOWN: &str = "nothing shows which byte of $MXPGN is the first: the last one on the line was taken, as MiniPlex writes it";
+const NO_PRIORITY: &str =
+    "$PCDIN has neither priority nor destination: its frames have priority 6, and are to all";
 
 /// The parameter groups from 1F000 to 1FEFF that are one frame each, less 1F000: those of canboat's table (2026, Apache-2.0).
 const SINGLE_FRAMES: [u16; 61] = [
@@ -40,32 +59,44 @@ pub(crate) struct Decoder {
     /// The last time of day, and the days before it: clocks without a date go over midnight.
     last_ns: i64,
     days_ns: i64,
+    /// How sentences of NMEA 0183 are written in this file.
+    habits: Habits,
+    /// The last time of a sentence, and whether it was that of a position.
+    sentence_ns: Option<i64>,
+    of_fix: bool,
+    /// The last stamp of `$PCDIN`, and what was lost to 32 bits before it.
+    stamp_ns: i64,
+    wrapped_ns: i64,
+    notes: Notes,
 }
 
-/// When a message was on the bus.
-#[derive(Clone, Copy)]
-enum Time<'a> {
-    OfDay(i64),
-    /// With a date, to be read only if the line is a frame's.
-    Date(&'a [u8]),
+/// What was said once.
+#[derive(Default)]
+struct Notes {
+    next: Vec<&'static str>,
+    said: Vec<&'static str>,
 }
 
-/// The fields of a line.
-struct Message<'a> {
-    time: Time<'a>,
-    direction: Direction,
-    /// The identifier of 29 bits; `None` if the group is not one of NMEA 2000, but a gateway's own.
-    id: Option<u32>,
-    data: Payload,
-    /// How many bytes there are, which may be more than a frame has.
-    len: usize,
-    /// Whether the line is in a form that has messages rather than frames.
-    of_messages: bool,
+impl Notes {
+    fn say(&mut self, note: &'static str) {
+        if !self.said.contains(&note) {
+            self.said.push(note);
+            self.next.push(note);
+        }
+    }
 }
 
 /// Whether a line is in one of the forms.
 pub(crate) fn is_line(line: &[u8]) -> bool {
     message(line.trim_ascii()).is_some()
+}
+
+/// Whether NMEA 0183 sentences of a text carry NMEA 2000.
+pub(crate) fn has_sentence(text: &[u8]) -> bool {
+    let begins = |line: &[u8]| matches!(line.first(), Some(b'$' | b'!' | b'\\' | b'0'..=b'9' | b'['));
+    let mut lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty());
+    lines.clone().find(|line| !line.starts_with(b"#")).is_some_and(begins)
+        && lines.any(|line| sentence::Line::of(line).is_some_and(|line| line.is_of_nmea2000()))
 }
 
 /// Whether a text is a log of Signal K with such a line.
@@ -87,7 +118,37 @@ fn of_signal_k(line: &[u8]) -> Option<(i64, &[u8])> {
 }
 
 fn message(line: &[u8]) -> Option<Message<'_>> {
-    frame_line(line).or_else(|| plain_line(line)).or_else(|| actisense_line(line))
+    frame_line(line)
+        .or_else(|| plain_line(line))
+        .or_else(|| actisense_line(line))
+        .or_else(|| library_line(line))
+}
+
+/// `228437 : Pri:2 PGN:130306 Source:105 Dest:255 Len:8 Data:0,F6,0,FB,96,FA,FF,FF`.
+fn library_line(line: &[u8]) -> Option<Message<'_>> {
+    let mut words = line.split(|byte| *byte == b' ').filter(|word| !word.is_empty());
+    let ms = words.next().and_then(text::decimal).and_then(|ms| i64::try_from(ms).ok())?;
+    words.next().filter(|word| *word == b":")?;
+    let mut number = |name: &[u8], most: u64| {
+        words.next()?.strip_prefix(name).and_then(text::decimal).filter(|number| *number <= most)
+    };
+    let [priority, group] = [number(b"Pri:", 7)?, number(b"PGN:", 0xFF_FFFF)?];
+    let [source, destination] = [number(b"Source:", 255)?, number(b"Dest:", 255)?];
+    let len = number(b"Len:", 1785)? as usize;
+    let cells: Vec<_> = words.next()?.strip_prefix(b"Data:")?.split(|byte| *byte == b',').collect();
+    let byte = |cell: &[u8]| text::hex(cell).and_then(|byte| u8::try_from(byte).ok());
+    let is_whole =
+        cells.len() == len && words.next().is_none() && cells.iter().all(|cell| byte(cell).is_some());
+    let data = Payload::words(cells.into_iter(), len.min(8), byte).ok()?;
+    let id = id(priority as u32, group as u32, source as u32, destination as u32);
+    is_whole.then_some(Message {
+        time: Time::Ns(ms.checked_mul(NS_PER_S / 1000)?),
+        direction: Direction::Rx,
+        id,
+        data,
+        len,
+        form: Form::Message,
+    })
 }
 
 /// `00:29:58.617 R 0DFF180D A2 8C 50 C0`.
@@ -106,7 +167,7 @@ fn frame_line(line: &[u8]) -> Option<Message<'_>> {
     let bytes = bytes.filter(|bytes| bytes.len() <= 8)?;
     let time = Time::OfDay(of_day_ns(hours, minutes, seconds)?);
     let data = Payload::of(&bytes)?;
-    Some(Message { time, direction, id: Some(id), data, len: bytes.len(), of_messages: false })
+    Some(Message { time, direction, id: Some(id), data, len: bytes.len(), form: Form::FrameIfAll })
 }
 
 /// `2011-11-24-22:42:04.388,2,127250,36,255,8,ff,10,3b,ff,7f,ce,f5,fc`.
@@ -129,7 +190,7 @@ fn plain_line(line: &[u8]) -> Option<Message<'_>> {
         id,
         data,
         len,
-        of_messages: false,
+        form: Form::FrameIfAll,
     })
 }
 
@@ -149,7 +210,7 @@ fn actisense_line(line: &[u8]) -> Option<Message<'_>> {
     let data = Payload::words(digits.chunks_exact(2), len.min(8), hex_byte).ok()?;
     let time = Time::OfDay(of_day_ns(&clock[..2], &clock[2..], seconds)?);
     let id = id(addresses & 0xF, group, addresses >> 12, addresses >> 4 & 0xFF);
-    Some(Message { time, direction: Direction::Rx, id, data, len, of_messages: true })
+    Some(Message { time, direction: Direction::Rx, id, data, len, form: Form::Message })
 }
 
 fn of_day_ns(hours: &[u8], minutes: &[u8], seconds: &[u8]) -> Option<i64> {
@@ -157,14 +218,6 @@ fn of_day_ns(hours: &[u8], minutes: &[u8], seconds: &[u8]) -> Option<i64> {
     let minutes = text::decimal(minutes).filter(|minutes| *minutes < 60)?;
     let seconds_ns = text::time(seconds, NS_PER_S, b'.').filter(|ns| (0..61 * NS_PER_S).contains(ns))?;
     Some((hours * 3600 + minutes * 60) as i64 * NS_PER_S + seconds_ns)
-}
-
-/// The identifier of a message's frames (SAE J1939-21): groups below F0 in their second byte have a destination.
-fn id(priority: u32, group: u32, source: u32, destination: u32) -> Option<u32> {
-    let is_addressed = group >> 8 & 0xFF < 0xF0;
-    let is_of_bus = priority <= 7 && group <= 0x3_FFFF && !(is_addressed && group & 0xFF != 0);
-    let low = if is_addressed { destination << 8 } else { 0 };
-    is_of_bus.then_some(priority << 26 | group << 8 | low | source)
 }
 
 /// Whether the messages of a group are one frame each, so that nothing was put together.
@@ -193,38 +246,111 @@ impl Decoder {
                 self.last_ns = of_day_ns;
                 Ok(self.days_ns.saturating_add(of_day_ns))
             }
+            Time::Ns(ns) => Ok(ns),
+            Time::Ticks(stamp) => {
+                const WRAP_NS: i64 = (1 << 32) * (NS_PER_S / 1000);
+                let ns = self.habits.ticks.ns(stamp);
+                let ns = ns.ok_or_else(|| Fault::malformed("a stamp of eight digits", stamp))?;
+                if self.habits.ticks == sentence::Ticks::Milliseconds && ns < self.stamp_ns - WRAP_NS / 2 {
+                    self.wrapped_ns = self.wrapped_ns.saturating_add(WRAP_NS);
+                }
+                self.stamp_ns = ns;
+                Ok(self.wrapped_ns.saturating_add(ns))
+            }
+            Time::Unknown => {
+                self.notes.say(if self.of_fix { TIMES_OF_FIXES } else { NO_TIMES });
+                Ok(self.sentence_ns.unwrap_or(0))
+            }
         }
     }
 }
 
+impl Decoder {
+    /// What a line says, of what is not left out, and when the line was written if that stands before it.
+    fn content<'a>(&mut self, line: &'a [u8], zone: &Zone) -> Result<Content<'a>, Fault> {
+        let (logged_ns, line) = match of_signal_k(line) {
+            Some((logged_ns, line)) => (Some(logged_ns), line),
+            None => (None, line),
+        };
+        if let Some(message) = message(line) {
+            return Ok(Content::Message(logged_ns, message));
+        }
+        let others = logged_ns.map_or(OTHER_SENTENCES, |_| OF_ANOTHER_SOURCE);
+        let Some(sentence) = sentence::Line::of(line) else {
+            return match logged_ns {
+                Some(_) => Ok(Content::LeftOut(others)),
+                None => Err(Fault::malformed(EXPECTED, line)),
+            };
+        };
+        let logged_ns = logged_ns.or_else(|| sentence.time_ns(zone));
+        if logged_ns.is_some() {
+            (self.sentence_ns, self.of_fix) = (logged_ns, false);
+        }
+        match sentence.content(self.habits) {
+            Sentence::Message(message) => {
+                if matches!(message.time, Time::Ticks(_)) {
+                    self.notes.say(NO_PRIORITY);
+                }
+                Ok(Content::Message(logged_ns, message))
+            }
+            Sentence::Fix(time_ns) => {
+                if logged_ns.is_none() && (self.of_fix || self.sentence_ns.is_none()) {
+                    (self.sentence_ns, self.of_fix) = (Some(time_ns), true);
+                }
+                Ok(Content::LeftOut(others))
+            }
+            Sentence::Other => Ok(Content::LeftOut(others)),
+            Sentence::ToGateway => Ok(Content::LeftOut(TO_GATEWAY)),
+            Sentence::Broken => Err(Fault::malformed(SENTENCE, line)),
+        }
+    }
+}
+
+/// What a line says.
+enum Content<'a> {
+    Message(Option<i64>, Message<'a>),
+    LeftOut(&'static str),
+}
+
 impl RowFormat for Decoder {
     fn begin(&mut self, buffered: &[u8]) {
-        let lines = buffered.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
-        let lines = lines.map(|line| of_signal_k(line).map_or(line, |(_, line)| line));
-        self.puts_together = lines.filter_map(message).any(|message| message.len > 8);
+        const SAMPLE_BYTES: usize = 64 << 10;
+        let lines = || {
+            let lines = buffered.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+            lines.map(|line| of_signal_k(line).map_or(line, |(_, line)| line))
+        };
+        self.puts_together = lines().filter_map(message).any(|message| message.len > 8);
+        let sample = &buffered[..buffered.len().min(SAMPLE_BYTES)];
+        self.habits = Habits::of(sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii));
+        if self.habits.order_unknown {
+            self.notes.say(ORDER_UNKNOWN);
+        }
     }
 
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         if line.is_empty() || line.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
-        let (logged_ns, line) = match of_signal_k(line) {
-            Some((logged_ns, line)) => (Some(logged_ns), line),
-            None => (None, line),
-        };
-        let message = match message(line) {
-            Some(message) => message,
-            None if logged_ns.is_some() => return Ok(Line::LeftOut(OF_ANOTHER_SOURCE)),
-            None => return Err(Fault::malformed(EXPECTED, line)),
+        let (logged_ns, message) = match self.content(line, zone)? {
+            Content::Message(logged_ns, message) => (logged_ns, message),
+            Content::LeftOut(what) => return Ok(Line::LeftOut(what)),
         };
         // A gateway's clock is the better one if it has a date.
         let time_ns = match (message.time, logged_ns) {
-            (Time::OfDay(_), Some(logged_ns)) => logged_ns,
-            (time, _) => self.time_ns(time, zone)?,
+            (Time::Date(_), _) | (_, None) => self.time_ns(message.time, zone)?,
+            (_, Some(logged_ns)) => logged_ns,
         };
+        if matches!(message.time, Time::Ns(_) | Time::Ticks(_)) {
+            (self.sentence_ns, self.of_fix) = (Some(time_ns), false);
+        }
         self.puts_together |= message.len > 8;
         let Some(raw) = message.id else { return Ok(Line::LeftOut(OF_THE_GATEWAY)) };
-        if message.len > 8 || (message.of_messages || self.puts_together) && !is_single(raw) {
+        let is_whole = match message.form {
+            Form::Frame => true,
+            Form::FrameIfAll => !self.puts_together || is_single(raw),
+            Form::Message => is_single(raw),
+        };
+        if message.len > 8 || !is_whole {
             return Ok(Line::LeftOut(PUT_TOGETHER));
         }
         let id = identifier(raw, true, line)?;
@@ -239,96 +365,17 @@ impl RowFormat for Decoder {
     }
 
     fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
-        // The form with commas says how many bytes there are, and no frame has more than 8.
+        // The form with commas says how many bytes there are, and no frame has more than 8; a sentence has a checksum.
+        if sentence::Line::of(line).is_some() {
+            return !line.contains(&b'*');
+        }
         !line.contains(&b',') && record.frame().is_none_or(|frame| frame.data().len() < 8)
+    }
+
+    fn note(&mut self) -> Option<&'static str> {
+        self.notes.next.pop()
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::super::tests;
-    use crate::{Format, ReadOptions, TraceReader};
-
-    fn as_log(file: &str) -> (String, Vec<String>) {
-        tests::as_log(Format::Nmea2000, file)
-    }
-
-    #[test]
-    fn frames_of_yacht_devices_are_read_over_midnight() {
-        let (log, issues) = as_log(
-            "23:59:59.617 R 0DFF180D A2 8C 50 C0 FF FF FF FF\r\n00:00:00.100 T 18EAFF44 14 F0 01\r\n\
-             00:00:00.050 R 09FD020D\r\n",
-        );
-        assert_eq!(issues, Vec::<String>::new());
-        assert_eq!(
-            log,
-            "(86399.617000) can0 0DFF180D#A28C50C0FFFFFFFF\n(86400.100000) can0 18EAFF44#14F001 T\n\
-             (86400.050000) can0 09FD020D#\n"
-        );
-    }
-
-    #[test]
-    fn the_plain_form_has_dates_of_several_kinds() {
-        let (log, issues) = as_log(
-            "# a drive\n2011-11-24-22:42:04.388,2,127250,36,255,8,ff,10,3b,ff,7f,ce,f5,fc\n\
-             2022-09-28T11:36:59.668Z,6,59904,36,23,3,14,f0,01\n2022-09-28T04:36:59.668-07:00,6,59904,36,255,3,14,f0,01,\n",
-        );
-        assert_eq!(issues, Vec::<String>::new());
-        assert_eq!(
-            log,
-            "(1322174524.388000) can0 09F11224#FF103BFF7FCEF5FC\n(1664365019.668000) can0 18EA1724#14F001\n\
-             (1664365019.668000) can0 18EAFF24#14F001\n"
-        );
-    }
-
-    #[test]
-    fn a_log_of_signal_k_has_dates_and_lines_of_other_sources() {
-        let file = "1555009219000;gps;$GPGLL,4916.45,N,12311.12,W,225444,A\n\
-                    1555009219100;ydgw;17:33:39.050 R 0DFF180D A2 8C 50 C0 FF FF FF FF\n\
-                    1555009219200;A;2019-04-11-17:33:39.150,6,59904,36,255,3,14,f0,01\n1555009219300;ydgw;17:3\n";
-        assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Nmea2000));
-        let (log, issues) = as_log(file);
-        assert_eq!(issues, Vec::<String>::new());
-        assert_eq!(
-            log,
-            "(1555009219.100000) can0 0DFF180D#A28C50C0FFFFFFFF\n(1555004019.150000) can0 18EAFF24#14F001\n"
-        );
-    }
-
-    /// Of the frames that a message was made of, such a file has nothing.
-    #[test]
-    fn what_was_put_together_is_counted_and_what_is_one_frame_is_read() {
-        let file = "A000159.990 CCFF7 0FF63 3B9F0000000002FF\nA000200.004 24FF2 1F112 FFFFCA300100FFFF\n\
-             A000200.005 24FF3 1F805 20945F1F44ED03030102\nA000200.006 24FF3 1F805 2094\n\
-             2011-11-24-22:42:04.388,2,393216,36,255,1,ff\n";
-        let (log, issues) = as_log(file);
-        assert_eq!(issues, Vec::<String>::new());
-        assert_eq!(
-            log,
-            "(119.990000) can0 1CFF63CC#3B9F0000000002FF\n(120.004000) can0 09F11224#FFFFCA300100FFFF\n"
-        );
-        let source = std::io::Cursor::new(file);
-        let mut reader =
-            TraceReader::from_source("test", source, Format::Nmea2000, &ReadOptions::default()).unwrap();
-        assert_eq!(reader.by_ref().count(), 2);
-        let left_out: Vec<_> = reader.left_out().iter().collect();
-        assert_eq!(left_out, [(super::PUT_TOGETHER, 2), (super::OF_THE_GATEWAY, 1)]);
-        // Without a message of more than a frame, every line is a frame.
-        let (log, _) = as_log("2011-11-24-22:42:04.388,2,129029,36,255,3,a0,2b,01\n");
-        assert_eq!(log, "(1322174524.388000) can0 09F80524#A02B01\n");
-    }
-
-    #[test]
-    fn broken_lines_are_named() {
-        let (log, issues) = as_log(
-            "00:29:58.617 R 2DFF180D A2\n00:29:58.617 X 0DFF180D A2\n25:29:58.617 R 0DFF180D A2\n00:29:58.617 R 0DFF180D A\n\
-             2011-11-24-22:42:04.388,2,127250,36,255,8,ff\n2011-11-24-22:42:04.388,8,127250,36,255,1,ff\n\
-             2011-13-24-22:42:04.388,2,127250,36,255,1,ff\n2011-11-24-22:42:04.388,2,127250,36,255,1,ff,ff\n\
-             A000159.990 CCFF7 0FF63 3B9\nA00\u{e9}159.990 CCFF7 0FF63 3B9F\n00:29:58.617 R 0DFF180D A2",
-        );
-        assert_eq!((log.as_str(), issues.len()), ("", 11), "{issues:#?}");
-        assert!(issues[10].contains("the file ends inside a line"), "{issues:#?}");
-        let (log, issues) = as_log("00:29:58.617 R 0DFF180D A2 8C 50 C0 FF FF FF FF");
-        assert_eq!((log.lines().count(), issues.len()), (1, 0), "{issues:?}");
-    }
-}
+mod tests;

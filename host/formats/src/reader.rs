@@ -153,9 +153,11 @@ fn recognise(
     let format = if let Some(format) = options.format {
         format
     } else if let Some(table) = table {
-        // Columns are those of a text, or of Parquet.
+        // Columns are those of a text, of Parquet or of JSON.
         let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
-        Format::of_content(head).filter(|format| *format == Format::Parquet).unwrap_or(table)
+        let typed = |format: &Format| matches!(format, Format::Parquet | Format::Json);
+        let named = Format::of_path(path).ok().filter(|format| *format == Format::Json);
+        Format::of_content(head).filter(typed).or(named).unwrap_or(table)
     } else {
         // A pipe may deliver only a single line for a long time.
         let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };

@@ -19,8 +19,8 @@ use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, slcan, table,
-    trc, usbcan,
+    crtd, csv, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, slcan,
+    table, trc, usbcan,
 };
 
 /// One format.
@@ -60,7 +60,8 @@ impl<'a> Head<'a> {
         let text = bytes[..bytes.len().min(HEAD_BYTES)].trim_ascii_start();
         let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_end);
         let line = lines.clone().next().unwrap_or_default();
-        let is_comment = |line: &[u8]| line.starts_with(b"#") || candump_screen::is_command(line);
+        let is_comment =
+            |line: &[u8]| line.starts_with(b"#") || line == b"--" || candump_screen::is_command(line);
         // The first line is not among the others any more.
         let first = std::iter::once(line).chain(lines).find(|line| !line.is_empty() && !is_comment(line));
         Self { bytes, text, line, first: first.unwrap_or_default() }
@@ -353,8 +354,12 @@ const FORMATS: &[FormatSpec] = &[
     FormatSpec {
         format: Format::Nmea2000,
         names: &["n2k"],
-        suffixes: &["raw", "txt", "log"],
-        begins: |head| nmea2000::is_line(head.first) || nmea2000::is_log_of_signal_k(head.text),
+        suffixes: &["raw", "txt", "log", "nmea"],
+        begins: |head| {
+            nmea2000::is_line(head.first)
+                || nmea2000::is_log_of_signal_k(head.text)
+                || nmea2000::has_sentence(head.bytes)
+        },
         has_head: false,
         reader: |_| Box::new(Rows::<nmea2000::Decoder>::default()),
         writer: None,
@@ -452,6 +457,15 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| head.bytes.starts_with(b"PAR1"),
         has_head: true,
         reader: parquet_reader,
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Json,
+        names: &["json"],
+        suffixes: &["json", "jsonl", "ndjson"],
+        begins: |head| json::is_head(head.bytes),
+        has_head: false,
+        reader: |options| Box::new(json::Decoder::new(options.columns.clone())),
         writer: None,
     },
 ];

@@ -6,7 +6,6 @@ mod layout;
 mod time;
 
 pub use columns::{BadColumns, Columns};
-#[cfg(feature = "parquet")]
 pub(crate) use columns::{TypedColumn, TypedForm};
 
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
@@ -47,6 +46,8 @@ pub(crate) struct Decoder {
     day: Option<FileDate>,
     interfaces: Interfaces,
     radix: Radix,
+    /// Whether cells come apart, from columns with types, of which one may have nothing in a row.
+    is_typed: bool,
     notes: Vec<&'static str>,
 }
 
@@ -128,12 +129,17 @@ impl Decoder {
         Ok(is_row)
     }
 
+    /// Whether these columns have a frame in each row.
+    pub(crate) fn has_frame(&self, columns: &[TypedColumn]) -> bool {
+        Layout::of_typed(self.columns.as_ref(), columns).is_ok()
+    }
+
     /// Prepares for rows whose cells come apart, from columns that have types. Returns the columns of which cells are wanted.
-    #[cfg(feature = "parquet")]
     pub(crate) fn begin_typed(&mut self, columns: &[TypedColumn]) -> Result<Vec<usize>, Fault> {
         let layout = Layout::of_typed(self.columns.as_ref(), columns)?;
         self.note_layout(&layout);
         let taken = layout.taken(columns.len());
+        self.is_typed = true;
         self.radix.data = layout
             .place(Role::Data)
             .or(layout.place(Role::Bytes))
@@ -143,7 +149,6 @@ impl Decoder {
     }
 
     /// Looks at the first rows' cells, before [`Self::typed_row`] takes them.
-    #[cfg(feature = "parquet")]
     pub(crate) fn first_typed_rows<'a>(&mut self, rows: impl Iterator<Item = &'a [&'a [u8]]>) {
         let place = self.layout.as_ref().and_then(|layout| layout.place(Role::Id));
         let ids: Vec<_> =
@@ -158,7 +163,6 @@ impl Decoder {
     }
 
     /// The record of a row with a cell for each column; empty where there is nothing, or where none is wanted.
-    #[cfg(feature = "parquet")]
     pub(crate) fn typed_row(&mut self, cells: &[&[u8]], zone: &Zone) -> Result<Line, Fault> {
         let Some(layout) = self.layout.take() else { return Ok(Line::Nothing) };
         let line = self.line_of_cells(&layout, cells, zone);
@@ -269,8 +273,14 @@ impl Decoder {
         cells: &[&[u8]],
         zone: &Zone,
     ) -> Result<TraceRecord, Fault> {
+        let is_typed = self.is_typed;
         let cell = |role| {
-            layout.place(role).map(|place| (cells.get(place.at).copied().unwrap_or_default(), place.form))
+            let place = layout.place(role)?;
+            let shown = cells.get(place.at).copied().unwrap_or_default();
+            // What has no value in a row says nothing there.
+            let is_absent =
+                is_typed && shown.is_empty() && matches!(role, Role::Dlc | Role::Extended | Role::Channel);
+            (!is_absent).then_some((shown, place.form))
         };
         let time_ns = match cell(Role::Time) {
             Some((time, form)) => self.time_ns(time, form, zone)?,

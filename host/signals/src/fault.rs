@@ -18,7 +18,7 @@ pub enum DatabaseError {
     },
     /// The suffix does not belong to any kind of database.
     #[error(
-        "{file} is not a known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
+        "{file} is not a known kind of database; use a .dbc, .kcd, .sym or .arxml file, a table of signals (.xlsx, .csv), or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.
@@ -205,6 +205,9 @@ pub enum FaultKind {
     /// The file is not in one of the usual encodings; which one was taken.
     #[error("the file is read as {0}; if texts look wrong, save it as UTF-8")]
     Encoding(&'static str),
+    /// What a table of signals does not say, and how it is read.
+    #[error("{0}")]
+    Guessed(String),
     /// A float with a length that most programs refuse.
     #[error("a float of {0} bits is unusual; it is read as the upper bits of the next longer one")]
     OddFloat(u16),
@@ -228,6 +231,7 @@ impl FaultKind {
                 | Self::Encoding(_)
                 | Self::UnflaggedIds { .. }
                 | Self::OddFloat(_)
+                | Self::Guessed(_)
         )
     }
 

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::fault::DatabaseError;
 use super::model::Database;
-use super::{arxml, dbc, file, kcd, sym};
+use super::{arxml, dbc, file, kcd, sheet, sym};
 
 /// The kinds of database files.
 #[derive(Clone, Copy)]
@@ -14,6 +14,10 @@ pub(crate) enum FileKind {
     Sym,
     Arxml,
     Toml,
+    /// A table of signals in a text.
+    Text,
+    /// One in a workbook, which is a ZIP archive itself.
+    Workbook,
 }
 
 impl FileKind {
@@ -25,12 +29,19 @@ impl FileKind {
             "sym" => Ok(Self::Sym),
             "arxml" => Ok(Self::Arxml),
             "toml" => Ok(Self::Toml),
+            "csv" | "tsv" => Ok(Self::Text),
+            "xlsx" | "xlsm" | "xls" => Ok(Self::Workbook),
             _ => Err(DatabaseError::UnknownKind { file: file.to_owned() }),
         }
     }
 
-    pub const fn is_toml(self) -> bool {
-        matches!(self, Self::Toml)
+    /// Whether it is what files of this suffix are, so that one in an archive is taken without being named.
+    pub const fn is_sure(self) -> bool {
+        !matches!(self, Self::Toml | Self::Text | Self::Workbook)
+    }
+
+    pub const fn is_workbook(self) -> bool {
+        matches!(self, Self::Workbook)
     }
 
     /// Whether a file may describe several buses.
@@ -45,6 +56,7 @@ impl FileKind {
             Self::Sym => sym::parse(file, bytes),
             Self::Arxml => arxml::parse_bus(file, bytes, bus),
             Self::Toml => file::parse(file, bytes),
+            Self::Text | Self::Workbook => sheet::parse(file, bytes),
         }
     }
 }

@@ -33,6 +33,7 @@ mod reading;
 mod scale;
 pub mod search;
 mod select;
+mod sheet;
 pub mod sym;
 pub mod trigger;
 mod unflagged;
@@ -58,7 +59,8 @@ pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. For a KCD or ARXML
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, a table of signals in `.xlsx`, `.csv` or `.tsv`, or
+/// `.toml` for cantap's own signal file. For a KCD or ARXML
 /// file with several buses, `FILE#BUS` selects one; without it, all are read as one.
 ///
 /// A file may be compressed with gzip (`car.dbc.gz`), or in a ZIP archive: `cars.zip`, if it has no other database, or `cars.zip/inside/car.dbc`.

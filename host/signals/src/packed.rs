@@ -63,7 +63,9 @@ pub(super) fn unpack<'a>(
             all(flate2::read::MultiGzDecoder::new(bytes)).map_err(|error| packed(&error.to_string()))?;
         return Ok((name.to_owned(), unpacked.into()));
     }
-    if zip::is_archive(bytes) {
+    let is_workbook =
+        inside.is_none() && FileKind::of(file, Path::new(file)).is_ok_and(FileKind::is_workbook);
+    if zip::is_archive(bytes) && !is_workbook {
         return member(file, bytes, inside).map(|(name, bytes)| (format!("{file}/{name}"), bytes.into()));
     }
     match inside {
@@ -96,7 +98,7 @@ fn member(file: &str, bytes: &[u8], wanted: Option<&str>) -> Result<(String, Vec
         let name = member.name.as_str();
         let is_own = !name.starts_with("__MACOSX/")
             && !name.rsplit('/').next().is_some_and(|last| last.starts_with('.'));
-        let is_database = is_own && FileKind::of(name, Path::new(name)).is_ok_and(|kind| !kind.is_toml());
+        let is_database = is_own && FileKind::of(name, Path::new(name)).is_ok_and(FileKind::is_sure);
         if is_database && names.len() < MOST_FILES {
             names.push(name.to_owned());
         }

@@ -188,7 +188,8 @@ impl Decoder {
         let malformed = || Fault::malformed(EXPECTED, line);
         let rest = line.strip_prefix(b"(").ok_or_else(malformed)?;
         let (time, rest) = split_at_byte(rest, b')').ok_or_else(malformed)?;
-        let time_ns = text::time(time, NS_PER_S, b'.')
+        // Programs that count from a trace's start put blanks before it.
+        let time_ns = text::time(time.trim_ascii_start(), NS_PER_S, b'.')
             .ok_or_else(|| Fault::malformed("a time in seconds between the parentheses", time))?;
         let (interface, rest) = text::word(rest);
         let (frame, rest) = text::word(rest);

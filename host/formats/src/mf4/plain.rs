@@ -105,7 +105,7 @@ impl Plain {
         let channel = get(&self.bus_channel)?.map_or(Some(self.bus), |channel| u8::try_from(channel).ok())?;
         let raw = self.id.get(bytes)?;
         let extended =
-            get(&self.ide)?.map_or(raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF, |flag| flag != 0);
+            get(&self.ide)?.map_or(raw & EXTENDED != 0, |flag| flag != 0) || raw & IDENTIFIER > 0x7FF;
         let id = (raw & IDENTIFIER) as u32;
         let id = if extended { Id::extended(id) } else { Id::standard(id) }?;
         let len = match get(&self.data_length)? {

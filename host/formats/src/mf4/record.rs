@@ -84,7 +84,7 @@ impl BusGroup {
         let flag = |flag: &Option<Number>| number(flag).is_some_and(|flag| flag != 0);
         let raw = number(&self.id).ok_or_else(|| Fault::malformed("a frame's identifier", b"none"))?;
         let extended =
-            number(&self.ide).map_or(raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF, |flag| flag != 0);
+            number(&self.ide).map_or(raw & EXTENDED != 0, |flag| flag != 0) || raw & IDENTIFIER > 0x7FF;
         let id = (raw & IDENTIFIER) as u32;
         let id = identifier(id, extended, b"")
             .or_else(|_| identifier(id, extended, format!("{id:X}").as_bytes()))?;

@@ -79,17 +79,16 @@ pub(super) struct Column {
 }
 
 /// A column whose type is known, unlike that of a text.
-#[cfg(feature = "parquet")]
 pub(crate) struct TypedColumn<'a> {
     pub name: &'a str,
     pub form: TypedForm,
 }
 
 /// What its type says about how its cells are written.
-#[cfg(feature = "parquet")]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum TypedForm {
     /// Times in seconds.
+    #[cfg_attr(not(feature = "parquet"), expect(dead_code, reason = "only Parquet has a type of times"))]
     Seconds,
     /// Numbers in decimal digits.
     Number,

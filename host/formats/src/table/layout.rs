@@ -3,7 +3,6 @@
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
 use super::columns::{Column, Columns, Form, ROLES, Role, role_of};
-#[cfg(feature = "parquet")]
 use super::columns::{TypedColumn, TypedForm};
 
 /// What separates the cells of a row.
@@ -154,7 +153,6 @@ impl Layout {
     }
 
     /// Of columns that have types, by what the user says or by their names. A type says how cells are written, unless the user does.
-    #[cfg(feature = "parquet")]
     pub(super) fn of_typed(columns: Option<&Columns>, typed: &[TypedColumn]) -> Result<Self, Fault> {
         // What has no cells has no name either.
         let named = |column: &TypedColumn| column.form != TypedForm::None;
@@ -191,7 +189,6 @@ impl Layout {
     }
 
     /// The columns that have a place in a trace, out of so many.
-    #[cfg(feature = "parquet")]
     pub(super) fn taken(&self, columns: usize) -> Vec<usize> {
         let is_byte = |at: usize| {
             let first = self.place(Role::Bytes).map(|place| place.at);

@@ -288,6 +288,13 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              1478198376.389428,18DAF110,1,1,Tx,0,0,,R\n1478198376.389429,123,0,0,Rx,1,3,,R\n\
              1478198376.389430,124,0,0,Rx,0,12,00 01 02 03 04 05 06 07 08 09 0A 0B,T\n",
         ),
+        text(
+            Format::Json,
+            "{\"timestamp\": 1.5, \"id\": 291, \"channel\": 2, \"is_rx\": true, \"dlc\": 2, \"data\": [17, 34]}\n\
+             {\"timestamp\": 1.6, \"id\": 419361278, \"channel\": 2, \"is_rx\": false, \"dlc\": 0, \"data\": []}\n\
+             {\"timestamp\": 1.7, \"id\": 291, \"channel\": 2, \"is_rx\": true, \"dlc\": 3, \"rtr\": true, \"data\": []}\n\
+             {\"timestamp\": 1.8, \"id\": 291, \"channel\": 2, \"is_rx\": true, \"dlc\": 9, \"data\": [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11]}\n",
+        ),
     ]
 }
 

@@ -69,7 +69,9 @@ fn row(format: Format) -> String {
                 ["as written, local if a clock", "– | – | yes | without ESI | yes | yes | that there was one"]
             }
             Format::RosEcho => ["1 ns", "– | – | yes | without flags | yes | yes | –"],
-            Format::Table => ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"],
+            Format::Table | Format::Json => {
+                ["as written, local if a date", "yes | yes | yes | without flags | – | – | –"]
+            }
             Format::Rlog => ["10 ms, an upper bound", "yes | yes | – | without flags | – | – | –"],
             Format::Mcap | Format::RosBag => {
                 ["1 ns", "by topic | by topic | yes | without flags | yes | yes | –"]

@@ -211,3 +211,24 @@ fn the_frames_of_a_sorted_group_whose_times_are_floats_are_plain_ones() {
     // All but the last, which nothing follows.
     assert_eq!(plain, 4999);
 }
+
+/// As a program writes them that knows no mark of 29 bits: every frame was left out.
+#[test]
+fn an_identifier_of_29_bits_that_is_marked_as_standard_is_read() {
+    let group = Group {
+        name: "CAN_DataFrame",
+        record_bytes: 32,
+        time: (0, 0, 64, 4),
+        step_s: None,
+        id: (8, 0, 29, 0),
+        bytes: (16, 0, 64, 10),
+        others: vec![("IDE", (12, 7, 1, 0)), ("DLC", (13, 0, 4, 0))],
+        more: 0,
+    };
+    let records = (0..10).map(|_| (0, [7; 12])).collect();
+    let layout = Layout { groups: vec![group], id_bytes: 0, records, pieces: Vec::new() };
+    let (records, issues) = tests::read(Format::Mf4, layout.file());
+    assert_eq!((records.len(), issues.first()), (10, None));
+    let id = records[0].frame().map(|frame| frame.id().to_string());
+    assert_eq!(id.as_deref(), Some("07070707"));
+}

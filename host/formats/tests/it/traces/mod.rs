@@ -51,6 +51,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::Table => "txt",
         Format::Sqlite => "db",
         Format::Parquet => "parquet",
+        Format::Json => "jsonl",
         Format::Rlog => "rlog",
         Format::Mcap => "mcap",
         Format::RosBag => "bag",

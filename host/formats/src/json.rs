@@ -1,0 +1,343 @@
+//! Frames as JSON: an object for each, on lines or in an array, as scripts write them: `{"timestamp": 1.5, "id": "123", "data": "DEADBEEF"}`.
+//!
+//! The names are those of a table's columns. What they do not say is what a table does not say either. `cantap search --json` has frames as candump
+//! writes them.
+
+mod object;
+
+use std::io;
+
+use super::codec::Decode;
+use super::found::Found;
+use super::input::Input;
+use super::issue::{Fault, Place};
+use super::row_format::{Line, RowFormat as _};
+use super::table::{self, Columns, TypedColumn, TypedForm};
+use super::text::{self, NS_PER_S};
+use super::zone::Zone;
+use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use object::{Field, Kind, Next};
+
+const NO_FRAMES: &str = "JSON objects that are no frames";
+const EXPECTED: &str =
+    "a JSON object with a frame, such as {\"timestamp\": 1.5, \"id\": \"123\", \"data\": \"DEADBEEF\"}";
+
+/// Reads the objects.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    table: table::Decoder,
+    columns: Vec<Column>,
+    /// Whether the first objects were looked at.
+    begun: bool,
+    /// Whether an object was entered for the array in it.
+    inside: bool,
+    notes: Vec<&'static str>,
+    noted: Vec<&'static str>,
+}
+
+/// A name that frames have.
+struct Column {
+    name: String,
+    form: TypedForm,
+}
+
+/// Whether a text begins with such frames.
+pub(crate) fn is_head(head: &[u8]) -> bool {
+    /// Enough for what a program says of itself before the frames.
+    const OBJECTS: usize = 8;
+    if !matches!(head.trim_ascii_start().first(), Some(b'{' | b'[' | 0x1E)) {
+        return false;
+    }
+    let decoder = Decoder::default();
+    let mut objects = objects(head).take(OBJECTS);
+    objects.any(|fields| own_frame(&fields).is_some() || decoder.is_frame(&fields))
+}
+
+/// The objects of a text, up to one that is not whole.
+fn objects(text: &[u8]) -> impl Iterator<Item = Vec<Field>> {
+    let (mut at, mut inside) = (0, false);
+    std::iter::from_fn(move || {
+        loop {
+            match object::next(&text[at..], inside) {
+                Next::Object { start, end, inner } => {
+                    let fields = object::fields(&text[at + start..at + end]);
+                    let is_frame = |fields: &Vec<Field>| Decoder::default().is_frame(fields);
+                    match inner.filter(|_| !fields.as_ref().is_some_and(is_frame)) {
+                        Some(inner) => (at, inside) = (at + inner, true),
+                        None => at += end,
+                    }
+                    if let Some(fields) = fields {
+                        return Some(fields);
+                    }
+                }
+                Next::Wrapper { inner } => (at, inside) = (at + inner, true),
+                // An object of which only the beginning is there may have the frames in it.
+                Next::More { start } => {
+                    let inner = memchr::memmem::find(&text[at + start..], b"{")?;
+                    let rest = &text[at + start + inner + 1..];
+                    let array = rest.windows(2).position(|pair| pair[0] == b'[')?;
+                    (at, inside) = (at + start + inner + 1 + array + 1, true);
+                }
+                Next::Other { .. } | Next::Broken { .. } | Next::End => return None,
+            }
+        }
+    })
+}
+
+/// A frame that stands in one value, as candump writes it.
+fn own_frame(fields: &[Field]) -> Option<TraceFrame> {
+    let frame = fields.iter().find(|field| field.name == "frame" && field.kind == Kind::Text)?;
+    frame.value.parse().ok()
+}
+
+/// Two times that are one: seconds, and what is left over of them.
+const SPLIT_TIMES: [(&str, &str, usize); 6] = [
+    ("ts_sec", "ts_usec", 6),
+    ("tv_sec", "tv_usec", 6),
+    ("sec", "usec", 6),
+    ("secs", "nsecs", 9),
+    ("sec", "nanosec", 9),
+    ("sec", "nsec", 9),
+];
+
+/// Makes of what only JSON has what tables have.
+fn tidy(fields: &mut Vec<Field>) {
+    let at = |fields: &[Field], name: &str| {
+        fields.iter().position(|field| field.kind == Kind::Number && field.name.eq_ignore_ascii_case(name))
+    };
+    for (seconds, rest, digits) in SPLIT_TIMES {
+        if let (Some(whole), Some(rest)) = (at(fields, seconds), at(fields, rest)) {
+            let fraction = format!(".{:0>digits$}", fields[rest].value);
+            fields[whole].value.push_str(&fraction);
+            "timestamp_s".clone_into(&mut fields[whole].name);
+            fields.remove(rest);
+            break;
+        }
+    }
+    for field in fields.iter_mut() {
+        let name = field.name.to_ascii_lowercase();
+        if field.kind == Kind::Text && matches!(name.as_str(), "is_rx" | "isrx") {
+            "direction".clone_into(&mut field.name);
+            field.value = if field.value == "true" { "rx" } else { "tx" }.to_owned();
+        }
+    }
+}
+
+impl Decoder {
+    /// With the names that the user gave, if any.
+    pub(crate) fn new(columns: Option<Columns>) -> Self {
+        Self { table: table::Decoder::new(columns), ..Self::default() }
+    }
+
+    fn is_frame(&self, fields: &[Field]) -> bool {
+        let typed: Vec<_> =
+            fields.iter().map(|field| TypedColumn { name: &field.name, form: TypedForm::Text }).collect();
+        self.table.has_frame(&typed)
+    }
+
+    /// Takes names that came for the first time into the columns.
+    fn learn(&mut self, fields: &[Field]) -> Result<bool, Fault> {
+        let mut is_new = false;
+        for field in fields.iter().filter(|field| field.kind != Kind::Nothing) {
+            if self.columns.iter().all(|column| column.name != field.name) {
+                let form = match field.kind {
+                    Kind::Number => TypedForm::Number,
+                    Kind::Bytes => TypedForm::Bytes,
+                    Kind::Text | Kind::Nothing => TypedForm::Text,
+                };
+                self.columns.push(Column { name: field.name.clone(), form });
+                is_new = true;
+            }
+        }
+        if is_new {
+            let typed: Vec<_> = self
+                .columns
+                .iter()
+                .map(|column| TypedColumn { name: &column.name, form: column.form })
+                .collect();
+            self.table.begin_typed(&typed)?;
+        }
+        Ok(is_new)
+    }
+
+    /// A cell for each column.
+    fn cells(&self, fields: &[Field]) -> Vec<String> {
+        let cell = |column: &Column| {
+            let Some(field) = fields.iter().find(|field| field.name == column.name) else {
+                return String::new();
+            };
+            match (column.form, field.kind) {
+                // An identifier that is sometimes a number and mostly a text of hexadecimal digits.
+                (TypedForm::Text, Kind::Number) if text::decimal(field.value.as_bytes()).is_some() => field
+                    .value
+                    .parse::<u64>()
+                    .map_or_else(|_| field.value.clone(), |number| format!("0x{number:X}")),
+                _ => field.value.clone(),
+            }
+        };
+        self.columns.iter().map(cell).collect()
+    }
+
+    /// Learns the columns from the frames at the beginning.
+    fn begin(&mut self, head: &[u8]) -> Result<(), Fault> {
+        const OBJECTS: usize = 200;
+        let first: Vec<_> = objects(head)
+            .take(OBJECTS)
+            .map(|mut fields| {
+                tidy(&mut fields);
+                fields
+            })
+            .filter(|fields| self.is_frame(fields))
+            .collect();
+        for fields in &first {
+            self.learn(fields)?;
+        }
+        let rows: Vec<_> = first.iter().map(|fields| self.cells(fields)).collect();
+        let rows: Vec<Vec<&[u8]>> =
+            rows.iter().map(|cells| cells.iter().map(String::as_bytes).collect()).collect();
+        if !rows.is_empty() {
+            self.table.first_typed_rows(rows.iter().map(Vec::as_slice));
+        }
+        Ok(())
+    }
+
+    /// What an object is.
+    fn object(&mut self, mut fields: Vec<Field>, zone: &Zone) -> Result<Line, Fault> {
+        if let Some(frame) = own_frame(&fields) {
+            return own_record(&fields, frame, zone).map(Line::Record);
+        }
+        tidy(&mut fields);
+        if !self.is_frame(&fields) {
+            return Ok(Line::LeftOut(NO_FRAMES));
+        }
+        if self.learn(&fields)? && self.columns.len() == fields.len() {
+            let cells = self.cells(&fields);
+            let row: Vec<&[u8]> = cells.iter().map(String::as_bytes).collect();
+            self.table.first_typed_rows(std::iter::once(row.as_slice()));
+        }
+        let cells = self.cells(&fields);
+        let row: Vec<&[u8]> = cells.iter().map(String::as_bytes).collect();
+        self.table.typed_row(&row, zone)
+    }
+}
+
+/// A line of `cantap search --json`.
+fn own_record(fields: &[Field], frame: TraceFrame, zone: &Zone) -> Result<TraceRecord, Fault> {
+    let value = |name: &str| {
+        fields.iter().find(|field| field.name == name).map(|field| field.value.as_bytes()).unwrap_or_default()
+    };
+    let time = value("time_s");
+    let time_ns = text::time(time, NS_PER_S, b'.').or_else(|| table::date(time, zone));
+    let time_ns = time_ns.ok_or_else(|| Fault::malformed("a time in seconds, time_s", time))?;
+    let channel = text::decimal(value("channel")).unwrap_or(1);
+    let channel =
+        u8::try_from(channel).map_err(|_| Fault::malformed("a channel of 0 to 255", value("channel")))?;
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+    Ok(TraceRecord { time_ns, channel, event })
+}
+
+impl Decode for Decoder {
+    fn needs_one_line(&self) -> bool {
+        false
+    }
+
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(note) = self.notes.pop() {
+            return Ok(Found::Note(note));
+        }
+        let zone = input.zone().clone();
+        loop {
+            let buffered = input.buffered();
+            if !buffered.is_empty() && !std::mem::replace(&mut self.begun, true) {
+                let head = buffered.to_vec();
+                if let Err(fault) = self.begin(&head) {
+                    let rest = head.len();
+                    input.consume_lines(rest, lines_in(&head));
+                    return Ok(Found::Issue(Place::Line(1), fault));
+                }
+            }
+            let text = input.buffered();
+            let (skipped, used, found) = match object::next(text, self.inside) {
+                Next::Object { start, end, inner } => {
+                    let fields = object::fields(&text[start..end]);
+                    match fields {
+                        Some(fields) => {
+                            let enters =
+                                inner.filter(|_| own_frame(&fields).is_none() && !self.is_frame(&fields));
+                            self.inside |= enters.is_some();
+                            let used = enters.unwrap_or(end);
+                            (
+                                start,
+                                used,
+                                Some(if enters.is_some() {
+                                    Ok(Line::Nothing)
+                                } else {
+                                    self.object(fields, &zone)
+                                }),
+                            )
+                        }
+                        None => (start, end, Some(Err(Fault::malformed(EXPECTED, shown(&text[start..end]))))),
+                    }
+                }
+                Next::Wrapper { inner } => {
+                    self.inside = true;
+                    (0, inner, None)
+                }
+                Next::Other { start, end } | Next::Broken { start, end } => {
+                    (start, end, Some(Err(Fault::malformed(EXPECTED, shown(&text[start..end])))))
+                }
+                Next::More { start } => {
+                    let len = text.len();
+                    if input.peek(len + 1)?.len() > len {
+                        continue;
+                    }
+                    let rest = input.buffered()[start..].to_vec();
+                    let place = Place::Line(input.line_number() + 1 + lines_in(&input.buffered()[..start]));
+                    let all = input.buffered().to_vec();
+                    input.consume_lines(all.len(), lines_in(&all));
+                    let fault = match rest.first() {
+                        _ if self.inside && rest.first() != Some(&b'{') => return Ok(Found::End),
+                        Some(b'{') => Fault::Truncated("an object"),
+                        _ => Fault::malformed(EXPECTED, shown(&rest)),
+                    };
+                    return Ok(Found::Issue(place, fault));
+                }
+                Next::End => {
+                    let all = text.to_vec();
+                    input.consume_lines(all.len(), lines_in(&all));
+                    if input.peek(1)?.is_empty() {
+                        return Ok(Found::End);
+                    }
+                    continue;
+                }
+            };
+            let line = input.line_number() + 1 + lines_in(&text[..skipped]);
+            let lines = lines_in(&text[..used]);
+            input.consume_lines(used, lines);
+            while let Some(note) = self.table.note() {
+                if !self.noted.contains(&note) {
+                    self.noted.push(note);
+                    self.notes.push(note);
+                }
+            }
+            match found {
+                None | Some(Ok(Line::Nothing | Line::Two(..))) => {}
+                Some(Ok(Line::Record(record))) => return Ok(Found::Record(record)),
+                Some(Ok(Line::LeftOut(what))) => return Ok(Found::LeftOut(what)),
+                Some(Err(fault)) => return Ok(Found::Issue(Place::Line(line), fault)),
+            }
+        }
+    }
+}
+
+fn lines_in(text: &[u8]) -> u64 {
+    memchr::memchr_iter(b'\n', text).count() as u64
+}
+
+fn shown(text: &[u8]) -> &[u8] {
+    const SHOWN: usize = 200;
+    &text[..text.len().min(SHOWN)]
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,127 @@
+//! Frames as scripts write them to JSON.
+
+use super::super::tests;
+use crate::{Format, ReadOptions, TraceReader};
+
+fn as_log(file: &str) -> (String, Vec<String>) {
+    assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Json), "{file}");
+    tests::as_log(Format::Json, file)
+}
+
+fn counts(file: &str) -> (Vec<(String, u64)>, Vec<String>) {
+    let source = std::io::Cursor::new(file.to_owned());
+    let mut reader = TraceReader::from_source("test", source, Format::Json, &ReadOptions::default()).unwrap();
+    reader.by_ref().count();
+    let left_out = reader.left_out().iter().map(|(what, count)| (what.to_owned(), count)).collect();
+    (left_out, reader.notes().iter().map(|(what, _)| what.to_owned()).collect())
+}
+
+#[test]
+fn objects_of_different_programs_are_read_whole() {
+    for (file, log) in [
+        // A message of python-can with its attributes.
+        (
+            "{\"timestamp\": 1700000000.5, \"arbitration_id\": 291, \"is_extended_id\": false, \"is_remote_frame\": false, \
+             \"is_rx\": true, \"dlc\": 2, \"data\": [17, 34]}\n\
+             {\"timestamp\": 1700000000.6, \"arbitration_id\": 419361278, \"is_extended_id\": true, \"is_remote_frame\": false, \
+             \"is_rx\": false, \"dlc\": 1, \"data\": [7]}\n\
+             {\"timestamp\": 1700000000.7, \"arbitration_id\": 292, \"is_extended_id\": false, \"is_remote_frame\": true, \
+             \"is_rx\": true, \"dlc\": 4, \"data\": []}\n",
+            "(1700000000.500000) can0 123#1122\n(1700000000.600000) can0 18FEF1FE#07 T\n(1700000000.700000) can0 124#R4\n",
+        ),
+        // Digits, milliseconds, a channel; names of several objects in one line.
+        (
+            "{\"ts_ms\":1700000000500,\"id\":\"0x123\",\"channel\":\"can1\",\"data\":\"DE AD\"}{\"ts_ms\":1700000000600,\"id\":\"0x18FEF1FE\",\"channel\":\"can0\",\"data\":\"beef\"}",
+            "(1700000000.500000) can1 123#DEAD\n(1700000000.600000) can0 18FEF1FE#BEEF\n",
+        ),
+        // An array over lines, with a stranger's keys around it.
+        (
+            "{\n  \"device\": \"logger\",\n  \"bus\": {\"bitrate\": 500000},\n  \"frames\": [\n    {\n      \"time\": 1.5,\n      \"can_id\": \"0x123\",\n      \
+             \"data\": [\"0x11\", \"0x22\"]\n    },\n    {\"time\": 1.6, \"can_id\": \"0x124\", \"data\": []}\n  ],\n  \"count\": 2\n}\n",
+            "(1.500000) can0 123#1122\n(1.600000) can0 124#\n",
+        ),
+        // Node's socketcan: two parts of a time, and a buffer; an MQTT bridge's frame inside of a message.
+        (
+            "{\"ts_sec\":1700000000,\"ts_usec\":500,\"id\":291,\"ext\":false,\"data\":{\"type\":\"Buffer\",\"data\":[1,2]}}\n",
+            "(1700000000.000500) can0 123#0102\n",
+        ),
+        (
+            "{\"topic\":\"can/rx\",\"payload\":{\"timestamp\":1.25,\"id\":\"7DF\",\"dlc\":2,\"data\":\"0201\"}}\n",
+            "(1.250000) can0 7DF#0201\n",
+        ),
+        // Our own, with CAN FD.
+        (
+            "{\"time_s\":1.5,\"channel\":2,\"match\":true,\"id\":\"123\",\"frame\":\"123##10102\"}\n{\"summary\":{\"found\":1}}\n",
+            "(1.500000) can1 123##10102\n",
+        ),
+    ] {
+        let (read, issues) = as_log(file);
+        assert_eq!((read.as_str(), issues.as_slice()), (log, &[][..]), "{file}");
+    }
+}
+
+#[test]
+fn what_is_no_frame_is_counted_and_what_is_broken_is_named_with_its_line() {
+    let file = "{\"ts\": 1.5, \"id\": \"0x123\", \"data\": \"11\"}\n{\"event\": \"start\", \"list\": [1, {\"a\": 2}]}\n\
+                {\"ts\": 1.6, \"id\": \"0x123\", \"da\n{\"ts\": 1.7, \"id\": \"0x123\", \"data\": \"12\"\n\
+                {\"ts\": 1.8, \"id\": \"0x123\", \"data\": \"13\"}\nrubbish\n{\"ts\": 1.9, \"id\": \"0x123\", \"data\": \"1\"}\n\
+                {\"ts\": 2.0, \"id\": \"0x123\", \"data\": \"14\"}\n{\"ts\": 2.1, \"id\": \"0x12";
+    let (log, issues) = as_log(file);
+    let lines = [
+        "(1.500000) can0 123#11\n",
+        "(1.800000) can0 123#13\n",
+        "(1.900000) can0 123#01\n",
+        "(2.000000) can0 123#14\n",
+    ];
+    assert_eq!(log, lines.concat());
+    let lines: Vec<_> =
+        issues.iter().map(|issue| issue.split([',', ':']).nth(1).unwrap_or_default().trim()).collect();
+    assert_eq!(issues.len(), 4, "{issues:#?}");
+    assert_eq!(lines, ["line 3", "line 4", "line 6", "line 9"], "{issues:#?}");
+    assert_eq!(counts(file).0, [(super::NO_FRAMES.to_owned(), 1)]);
+}
+
+/// A key that only some objects have is no less one of a frame.
+#[test]
+fn names_that_come_later_count_from_then_on() {
+    let file = "{\"ts\": 1.5, \"id\": 291, \"data\": [1]}\n{\"ts\": 1.6, \"id\": 291, \"data\": [], \"rtr\": true, \"dlc\": 3}\n";
+    assert_eq!(as_log(file), ("(1.500000) can0 123#01\n(1.600000) can0 123#R3\n".to_owned(), vec![]));
+    let file = "{\"ts\": 1.5, \"id\": 291, \"data\": [1], \"bus\": 1}\n{\"ts\": 1.6, \"id\": 419361278, \"data\": [], \"ext\": true}\n\
+                {\"ts\": 1.7, \"id\": 419361278, \"data\": []}\n";
+    let log = "(1.500000) can1 123#01\n(1.600000) can0 18FEF1FE#\n(1.700000) can0 18FEF1FE#\n";
+    assert_eq!(as_log(file), (log.to_owned(), vec![]));
+    let many = "{\"ts\": 1.5, \"id\": 291, \"data\": [1]}\n".repeat(20_000);
+    let file = format!("{many}{{\"ts\": 1.6, \"id\": 291, \"data\": [], \"rtr\": true, \"dlc\": 3}}\n");
+    let (log, issues) = as_log(&file);
+    assert_eq!(
+        (log.lines().count(), log.lines().last(), issues.len()),
+        (20_001, Some("(1.600000) can0 123#R3"), 0)
+    );
+    assert!(
+        counts("{\"id\": \"291\", \"data\": \"01\"}\n").1.iter().any(|note| note.contains("may be decimal"))
+    );
+}
+
+#[test]
+fn a_frame_in_a_long_object_and_columns_by_name_are_read() {
+    let frames: Vec<_> = (0..9000)
+        .map(|at| format!("{{\"t\": {at}, \"who\": \"0x1{:02X}\", \"what\": \"AA\"}}", at % 256))
+        .collect();
+    let file = format!("{{\"frames\": [{}], \"end\": {{\"x\": 1}}}}", frames.join(", "));
+    let options = ReadOptions {
+        format: Some(Format::Json),
+        columns: Some("time=t:ms,id=who:hex,data=what".parse().unwrap()),
+        ..ReadOptions::default()
+    };
+    let (records, issues) = tests::read_with(&options, &file);
+    assert_eq!((records.len(), issues), (9000, vec![]));
+    assert_eq!(tests::write(Format::Candump, &records[8999..]), "(8.999000) can0 127#AA\n");
+}
+
+proptest::proptest! {
+    #[test]
+    fn anything_is_read_to_its_end(text in "[{}\\[\\]\",:0-9a-z\\\\\n ]{0,200}") {
+        let (_, _) = tests::as_log(Format::Json, &text);
+        let _ = Format::of_content(text.as_bytes());
+    }
+}

@@ -14,6 +14,7 @@ mod analyser;
 mod archive;
 mod asc;
 mod battery_emulator;
+mod bit_rates;
 mod blf;
 mod busmaster;
 mod calendar;

@@ -112,7 +112,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| asc::is_head(head.text),
         has_head: true,
         reader: |options| Box::new(asc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(asc::Encoder::new(&options.zone))),
+        writer: Some(|options| Box::new(asc::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::Blf,
@@ -121,7 +121,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| head.bytes.starts_with(blf::FILE_MAGIC),
         has_head: true,
         reader: |options| Box::new(blf::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(blf::Encoder::new(&options.zone))),
+        writer: Some(|options| Box::new(blf::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V2_1),
@@ -130,7 +130,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| trc::is_head(head.text, head.line),
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_1, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_1, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V2_0),
@@ -139,7 +139,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_0, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_0, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_3),
@@ -148,7 +148,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_3, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_3, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_2),
@@ -157,7 +157,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_2, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_2, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_1),
@@ -166,7 +166,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_1, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_1, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_0),
@@ -175,7 +175,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_0, &options.zone))),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_0, options))),
     },
     FormatSpec {
         format: Format::Csv(CsvDialect::PythonCan),
@@ -249,7 +249,7 @@ const FORMATS: &[FormatSpec] = &[
         },
         has_head: true,
         reader: |_| Box::new(mf4::Decoder::default()),
-        writer: Some(|_| Box::new(mf4::Encoder::default())),
+        writer: Some(|options| Box::new(mf4::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::CandumpScreen,

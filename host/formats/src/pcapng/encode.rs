@@ -116,7 +116,7 @@ impl Encoder {
             // Reserved, and no limit on a packet's length.
             out.extend_from_slice(&[0; 6]);
             option(out, IF_NAME, cantap_trace::Interface(channel).to_string().as_bytes());
-            if let Some(known) = known {
+            if let Some(known) = known.filter(|known| !known.description.is_empty()) {
                 option(out, IF_DESCRIPTION, cut(&known.description).as_bytes());
             }
             if let Some(bitrate_bps) = known.and_then(|known| known.bitrate_bps) {

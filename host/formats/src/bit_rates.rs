@@ -3,8 +3,8 @@
 
 use cantap_can::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
+use super::channel_info::ChannelInfo;
 use super::event_text::MARK;
-use super::writer::ChannelInfo;
 
 const NAME: &str = "bit-rates ";
 

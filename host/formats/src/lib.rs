@@ -25,6 +25,7 @@ mod canhacker;
 mod canking;
 mod carbus;
 mod carriage_return;
+mod channel_info;
 mod codec;
 mod compressed;
 mod compression;
@@ -92,6 +93,7 @@ mod zone;
 pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
 pub use archive::ArchiveError;
+pub use channel_info::ChannelInfo;
 pub use create::{create_stream_writer, create_writer};
 pub use csv::CsvDialect;
 pub use format::Format;
@@ -106,7 +108,7 @@ pub use seek::IndexFolder;
 pub use table::{BadColumns, Columns};
 pub use trc::TrcVersion;
 pub use unread::{Readable, Unread};
-pub use writer::{ChannelInfo, TraceWriter, WriteOptions};
+pub use writer::{TraceWriter, WriteOptions};
 pub use zone::{UnknownZone, Zone};
 
 /// Seconds with a fraction, as nanoseconds.

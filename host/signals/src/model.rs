@@ -408,7 +408,7 @@ impl Signal {
     #[must_use]
     pub fn for_programs(&self, number: Number) -> Number {
         match number {
-            Number::Real(value) if self.factor == 1.0 && self.offset == 0.0 => {
+            Number::Real(value) if self.factor.to_bits() == 1.0_f64.to_bits() && self.offset == 0.0 => {
                 Number::Real(self.fewest_digits(value).unwrap_or(value))
             }
             _ => number,

@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
+use super::super::channel_info::ChannelInfo;
 use super::super::codec::Encode;
 use super::super::left_out::LeftOut;
 use super::super::socketcan_packet::{EXTENDED, FD_PACKET_BYTES, LINK_TYPE, PACKET_BYTES, REMOTE};
-use super::super::writer::{ChannelInfo, WriteOptions};
+use super::super::writer::WriteOptions;
 use super::{
     BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS,
     IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION, ISB_IFDROP, ISB_IFRECV,

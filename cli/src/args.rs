@@ -45,6 +45,14 @@ pub fn channels(text: &str) -> Result<Channels, String> {
     })
 }
 
+/// Like [`channels`], for a trace, which may have more channels than any device.
+pub fn channels_of_trace(text: &str) -> Result<Channels, String> {
+    if matches!(text, "both" | "all") {
+        return Ok(Channels::all());
+    }
+    text.split(',').map(channel_of_trace).collect::<Result<_, _>>().map(Channels::of_numbers)
+}
+
 /// Like [`channels`], for one device.
 pub fn channels_of_one(text: &str) -> Result<Channels, String> {
     let channels = channels(text)?;

@@ -13,7 +13,7 @@ use arrow_array::{Array, ArrayRef, BooleanArray, RecordBatch, UInt32Array};
 use arrow_schema::DataType;
 use cantap_columns::FrameColumns;
 use cantap_signals::encode::{EncodeError, Input, encode_message};
-use cantap_signals::{Decoder, Indicator, Message, MessageRef, SignalValue};
+use cantap_signals::{Decoder, Indicator, Message, MessageRef, Number, SignalValue};
 use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::{Frame as ClassicFrame, TraceFrame, TraceRecord};
 use pyo3::exceptions::PyTypeError;
@@ -133,7 +133,10 @@ impl Database {
             let signal = &message.signals[value.signal as usize];
             let indicator = message.indicator(signal, value.raw);
             let name = signal.label();
-            by_name.set_item(&*name, indicator.is_none().then_some(value.value))?;
+            by_name.set_item(
+                &*name,
+                indicator.is_none().then(|| signal.for_programs(Number::Real(value.value)).as_f64()),
+            )?;
             if let Some(text) = signal.text(value.raw).or(indicator.map(Indicator::name)) {
                 by_name.set_item(format!("{name}{TEXT}"), text)?;
             }

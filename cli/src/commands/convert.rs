@@ -8,7 +8,8 @@ use anyhow::bail;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::Key;
 use cantap_formats::{
-    Columns, CsvDialect, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
+    ChannelInfo, Columns, CsvDialect, DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle,
+    WriteOptions, Zone,
 };
 use cantap_signals::named::NamedFilter;
 
@@ -21,6 +22,7 @@ use crate::input::{FollowArgs, ReadArgs};
 use crate::range_args::RangeArgs;
 use crate::trace_output::{TraceOutput, named};
 use crate::usage_error::usage;
+use cantap_work::channels::Channels;
 use cantap_work::interrupt;
 use cantap_work::missing::by_kind;
 
@@ -55,9 +57,9 @@ pub struct Args {
     filter_options: Vec<NamedFilter>,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Only these channels: 1, 2, several as 1,3. Can be repeated. Default: all.
-    #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
-    channel: Vec<u8>,
+    /// Only these channels: 1, 2, several as 1,3, or both, which means all. Can be repeated. Default: all.
+    #[arg(short, long, value_parser = args::channels_of_trace, add = completion::channels())]
+    channel: Vec<Channels>,
     #[command(flatten)]
     range: RangeArgs,
     #[command(flatten)]
@@ -250,7 +252,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let mut output: Option<TraceOutput> = None;
     // Only once there is something to write: if nothing can be read, an older OUT stays unchanged.
-    let create = || args.create(&options, grows);
+    let create = |bit_rates: &[(u8, u32)]| {
+        let chosen = |channel: u8| {
+            args.channel.is_empty() || args.channel.iter().any(|channels| channels.has(channel))
+        };
+        let known = bit_rates.iter().filter(|(channel, _)| chosen(*channel));
+        let channels = known.map(|(channel, bps)| ChannelInfo {
+            channel: *channel,
+            bitrate_bps: Some(*bps),
+            description: String::new(),
+        });
+        args.create(&WriteOptions { channels: channels.collect(), ..options.clone() }, grows)
+    };
     let mut written = 0_u64;
     let mut batch = Vec::new();
     let read = loop {
@@ -261,10 +274,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         let output = match &mut output {
             Some(output) => output,
-            none => none.insert(create()?),
+            none => none.insert(create(records.bit_rates())?),
         };
         for record in &batch {
-            if args.channel.is_empty() || args.channel.contains(&record.channel) {
+            if args.channel.is_empty() || args.channel.iter().any(|channels| channels.has(record.channel)) {
                 output.write(record)?;
                 written += 1;
             }
@@ -278,7 +291,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Err(error);
     }
     // An empty trace is still a trace.
-    let output = output.map_or_else(create, Ok)?;
+    let output = output.map_or_else(|| create(records.bit_rates()), Ok)?;
     let mut left_out = output.finish()?;
     if args.json {
         let missing = records.missing();

@@ -46,7 +46,7 @@ pub struct Args {
     /// Signals to draw, by name or Message.Signal; with *, ? and [a-z]. Can be repeated. Default: all.
     #[arg(short, long = "signal", value_name = "PATTERN", add = completion::signals())]
     signals: Vec<String>,
-    /// Draw the bus load over time, or frames/s if no bit rate is given.
+    /// Draw the bus load over time, or frames/s if no bit rate is given and the trace says none.
     #[arg(long, conflicts_with_all = ["signals", "timing"])]
     bus_load: bool,
     /// Draw a histogram of this identifier's periods.
@@ -151,7 +151,14 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
             ..ChannelBitrate::options(&args.bitrates)
         };
         let mut collector = LoadCollector::new(options)?;
-        let read = for_each(args, filters, |record| collector.push(record))?;
+        let mut learned = 0;
+        let read = for_each(args, filters, |bit_rates, record| {
+            for (channel, bps) in bit_rates.get(learned..).unwrap_or_default() {
+                collector.learn_bitrate(*channel, *bps);
+            }
+            learned = bit_rates.len();
+            collector.push(record);
+        })?;
         let (plot, unknown) = collector.finish_counting(title("bus load"));
         if plot.is_empty() && unknown > 0 {
             bail!(
@@ -172,7 +179,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
-        let read = for_each(args, filters()?, |record| collector.push(record))?;
+        let read = for_each(args, filters()?, |_, record| collector.push(record))?;
         let plot = collector.finish(title(&format!("periods of {id}")));
         if plot.panes.is_empty() {
             bail!("there are no two frames of {id} without a loss between them in {name}");
@@ -186,7 +193,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     }
     let decoder = load_selected(&args.databases.options(), args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
-    let mut read = for_each(args, args.read.filters(&decoder)?, |record| collector.push(record))?;
+    let mut read = for_each(args, args.read.filters(&decoder)?, |_, record| collector.push(record))?;
     if collector.is_empty() {
         bail!("none of the signals is in {name}{}; `cantap decode` shows what is", within(args));
     }
@@ -206,10 +213,11 @@ fn within(args: &Args) -> &'static str {
 }
 
 /// Reads the part of the trace to be drawn.
+/// Reads the trace. `take` also gets the bit rates that the trace has said so far.
 fn for_each(
     args: &Args,
     filters: Vec<Filter>,
-    mut take: impl FnMut(&cantap::TraceRecord),
+    mut take: impl FnMut(&[(u8, u32)], &cantap::TraceRecord),
 ) -> anyhow::Result<Read> {
     let mut records = args.read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let mut batch = Vec::new();
@@ -217,7 +225,7 @@ fn for_each(
     while records.next_batch(&mut batch)? {
         for record in &batch {
             first_ns = first_ns.or(Some(record.time_ns));
-            take(record);
+            take(records.bit_rates(), record);
         }
     }
     Ok(Read { first_ns, missing: records.missing(), not_drawn: 0 })

@@ -54,7 +54,7 @@ pub struct Args {
     device: Vec<Address>,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel; auto has a device find it by
     /// listening. Can be repeated. Without it, a file has a load if it
-    /// says its bit rates (pcapng), and a device listens at the saved bit rate.
+    /// says its bit rates (pcapng, ASC, BLF, TRC, MF4), and a device listens at the saved bit rate.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<RequestedRate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), only for that channel. Can

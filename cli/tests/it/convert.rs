@@ -35,6 +35,59 @@ fn lines(numbers: &[usize]) -> String {
     numbers.iter().map(|number| TRACE.split_inclusive('\n').nth(*number).unwrap()).collect()
 }
 
+/// Wherever a trace goes, its bit rates go along, and the load is known without `-b`.
+#[test]
+fn bit_rates_go_along_from_format_to_format() {
+    let directory = directory("bit_rates");
+    fs::write(directory.join("known.log"), format!("# cantap: bit-rates 1=500000 2=125000\n{TRACE}"))
+        .unwrap();
+    let mut before = "known.log".to_owned();
+    for name in ["a.asc", "b.blf", "c.trc", "d.mf4", "e.pcapng", "f.asc"] {
+        let (code, _, err) = cantap(&directory, &["convert", &before, name, "-c", "both"]);
+        assert_eq!(code, Some(0), "{name}: {err}");
+        let (code, out, err) = cantap(&directory, &["stats", name]);
+        assert_eq!(code, Some(0), "{name}: {err}");
+        assert!(out.contains("Channel 1 at 500000 bit/s, as the trace says"), "{name}: {out}");
+        assert!(out.contains("Channel 2 at 125000 bit/s, as the trace says"), "{name}: {out}");
+        let (_, out, _) = cantap(&directory, &["stats", name, "-b", "250k"]);
+        assert!(out.contains("Channel 1 at 250000 bit/s\n"), "what is given comes first: {out}");
+        let (_, out, _) = cantap(&directory, &["stats", name, "--json"]);
+        let statistics: serde_json::Value = serde_json::from_str(&out).unwrap();
+        assert_eq!(statistics["channels"][1]["bitrate_from_trace"], true, "{name}: {out}");
+        name.clone_into(&mut before);
+    }
+    let (_, out, _) = cantap(&directory, &["convert", &before, "-"]);
+    assert_eq!(out, TRACE);
+}
+
+#[test]
+fn channels_are_chosen_as_in_every_command() {
+    let directory = directory("channels");
+    for all in [&["-c", "both"][..], &["-c", "all"], &["-c", "1,2"], &["-c", "1", "-c", "can1"], &[]] {
+        let (code, out, err) = cantap(&directory, &[&["convert", "trace.log", "-"], all].concat());
+        assert_eq!((code, out.as_str()), (Some(0), TRACE), "{all:?}: {err}");
+    }
+    let (_, out, _) = cantap(&directory, &["convert", "trace.log", "-", "-c", "2"]);
+    assert_eq!(out, lines(&[1, 4]));
+    for wrong in ["0", "256", "x", ""] {
+        let (code, _, err) = cantap(&directory, &["convert", "trace.log", "-", "-c", wrong]);
+        assert_eq!(code, Some(2), "{wrong}: {err}");
+    }
+}
+
+/// A script's variable that is not set must not mean everything.
+#[test]
+fn an_empty_filter_is_refused_however_it_is_written() {
+    let directory = directory("empty_filter");
+    for empty in ["", ",", " ", ",,"] {
+        let (code, out, err) = cantap(&directory, &["convert", "trace.log", "-", "-f", empty]);
+        assert_eq!((code, out.as_str()), (Some(2), ""), "'{empty}'");
+        assert!(err.contains("a filter is empty; write any for all frames"), "'{empty}': {err}");
+    }
+    let (_, out, _) = cantap(&directory, &["convert", "trace.log", "-", "-f", "any"]);
+    assert_eq!(out, TRACE);
+}
+
 #[test]
 fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compressed() {
     let directory = directory("there_and_back");

@@ -69,6 +69,34 @@ fn json_lines_have_exactly_the_documented_keys() {
     );
 }
 
+/// 0.1 on the bus is 0.10000000149011612 as a double; what is no such float keeps every digit.
+#[test]
+fn a_float_of_32_bits_has_the_digits_that_read_back_as_the_same_float() {
+    let directory = directory("floats");
+    let database = "BO_ 1 M: 8 A\n SG_ F : 0|32@1- (1,0) [0|0] \"\" A\n SG_ Scaled : 32|32@1- (0.5,0) [0|0] \"\" A\n\
+                    SIG_VALTYPE_ 1 F : 1;\nSIG_VALTYPE_ 1 Scaled : 1;\n";
+    std::fs::write(directory.join("floats.dbc"), database).unwrap();
+    std::fs::write(directory.join("floats.log"), "(1.000000) can0 001#CDCCCC3DCDCCCC3D\n").unwrap();
+    let decode = |form: &[&str]| {
+        let (code, out, err) =
+            cantap("floats", &[&["decode", "--db", "floats.dbc", "floats.log"], form].concat());
+        assert_eq!(code, Some(0), "{err}");
+        out
+    };
+    assert!(
+        decode(&["--json"]).contains("\"F\":0.1,\"Scaled\":0.05000000074505806}"),
+        "{}",
+        decode(&["--json"])
+    );
+    assert!(decode(&["--csv"]).contains(",F,0.1,"), "{}", decode(&["--csv"]));
+    assert!(
+        decode(&["--csv", "--wide"]).contains(",0.1,0.05000000074505806"),
+        "{}",
+        decode(&["--csv", "--wide"])
+    );
+    assert!(decode(&[]).contains("F = 0.1, Scaled = 0.05"), "{}", decode(&[]));
+}
+
 #[test]
 fn csv_is_one_line_per_chosen_signal() {
     let arguments =

@@ -5,6 +5,7 @@
 mod tests;
 
 use super::analyser::{CsvLayout, TableEncoder};
+use super::bit_rates;
 use super::codec::{Decode, Encode};
 use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
@@ -41,6 +42,10 @@ pub(crate) struct FormatSpec {
 }
 
 type MakeWriter = fn(&WriteOptions) -> Box<dyn Encode>;
+
+fn trc_writer(version: TrcVersion, options: &WriteOptions) -> Box<dyn Encode> {
+    Box::new(trc::Encoder::new(version, &options.zone, bit_rates::known(&options.channels)))
+}
 
 /// The beginning of a file.
 struct Head<'a> {
@@ -113,7 +118,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| asc::is_head(head.text),
         has_head: true,
         reader: |options| Box::new(asc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(asc::Encoder::new(&options.zone))),
+        writer: Some(|options| Box::new(asc::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::Blf,
@@ -122,7 +127,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| head.bytes.starts_with(blf::FILE_MAGIC),
         has_head: true,
         reader: |options| Box::new(blf::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(blf::Encoder::new(&options.zone))),
+        writer: Some(|options| Box::new(blf::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V2_1),
@@ -131,7 +136,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| trc::is_head(head.text, head.line),
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_1, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V2_1, options)),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V2_0),
@@ -140,7 +145,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_0, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V2_0, options)),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_3),
@@ -149,7 +154,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_3, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V1_3, options)),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_2),
@@ -158,7 +163,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_2, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V1_2, options)),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_1),
@@ -167,7 +172,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_1, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V1_1, options)),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_0),
@@ -176,7 +181,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_0, &options.zone))),
+        writer: Some(|options| trc_writer(TrcVersion::V1_0, options)),
     },
     FormatSpec {
         format: Format::Csv(CsvDialect::PythonCan),
@@ -250,7 +255,7 @@ const FORMATS: &[FormatSpec] = &[
         },
         has_head: true,
         reader: |_| Box::new(mf4::Decoder::default()),
-        writer: Some(|_| Box::new(mf4::Encoder::default())),
+        writer: Some(|options| Box::new(mf4::Encoder::new(options))),
     },
     FormatSpec {
         format: Format::CandumpScreen,

@@ -70,6 +70,37 @@ impl TrcVersion {
     }
 }
 
+/// The last column of the table of buses in the head, as PCAN-Explorer has it.
+const BIT_RATE: &str = "Bit rate";
+
+/// `500 kBit/s`, as PEAK's programs write a bit rate; exact.
+fn bit_rate_text(bps: u32) -> String {
+    if bps.is_multiple_of(1_000_000) {
+        format!("{} MBit/s", bps / 1_000_000)
+    } else {
+        format!("{} kBit/s", f64::from(bps) / 1e3)
+    }
+}
+
+/// The bus and its bit rate, outside data phases, in a row of the table of buses: `1  PCAN  Untitled@pcan_usb  CAN  500 kbit/s`; of
+/// a bus with CAN FD `Nominal 1 MBit/s, Data 8 MBit/s`.
+fn bus_row(row: &[u8]) -> Option<(u8, u32)> {
+    let row = std::str::from_utf8(row).ok()?;
+    let words: Vec<_> = row.split_ascii_whitespace().collect();
+    let channel = words.first()?.parse().ok()?;
+    let rate = words.windows(2).skip(1).find_map(|pair| {
+        let number: f64 = pair[0].parse().ok()?;
+        let factor = match pair[1].trim_end_matches(',').to_ascii_lowercase().as_str() {
+            "bit/s" => 1.0,
+            "kbit/s" => 1e3,
+            "mbit/s" => 1e6,
+            _ => return None,
+        };
+        Some((number * factor).round() as u32)
+    });
+    Some((channel, rate?))
+}
+
 /// Days from the format's day 0, 1899-12-30, to the Unix epoch.
 const EPOCH_DAY: i64 = 25_569;
 

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::Format;
 use super::analyser::TableStyle;
+use super::channel_info::ChannelInfo;
 use super::left_out::LeftOut;
 use super::rotation::Rotation;
 use super::zone::Zone;
@@ -27,17 +28,6 @@ pub struct WriteOptions {
     /// For anyone who reads while it is written, in formats that have a place for it: [`TraceWriter::flush`] writes the header even
     /// before the first record, and each channel's frames received and lost at this interval.
     pub statistics_every: Option<Duration>,
-}
-
-/// What is known of a channel before anything is heard on it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ChannelInfo {
-    /// From 1.
-    pub channel: u8,
-    /// The bus's bit rate, in bit/s.
-    pub bitrate_bps: Option<u32>,
-    /// A description of where it is and how it was opened.
-    pub description: String,
 }
 
 /// Takes records and writes them to a file.

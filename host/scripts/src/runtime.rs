@@ -456,7 +456,7 @@ impl Runtime {
         let readings = values.iter().map(|value| Reading::of(message, value));
         readings
             .map(|reading| {
-                let value = match reading.number {
+                let value = match reading.number_for_programs() {
                     Some(number) => Dynamic::from(number.as_f64()),
                     None => Dynamic::from(reading.indicator.unwrap_or_default().to_owned()),
                 };

@@ -54,7 +54,7 @@ pub use layout::ByteOrder;
 pub use model::{
     Alarm, Alarms, Colour, Database, Digital, Message, Multiplexed, Signal, ValueKind, ValueTable,
 };
-pub use number::Number;
+pub use number::{Number, shortest_of_f32};
 pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};

@@ -10,7 +10,7 @@ use cantap_can::Id;
 use super::container::{Container, InPdu};
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};
-use super::number::Number;
+use super::number::{Number, shortest_of_f32};
 use super::scale::Scale;
 use cantap_trace::clean;
 
@@ -393,20 +393,40 @@ impl Signal {
     /// the bus is 0.10000000149011612 as a double; otherwise as [`Number::for_people`].
     pub fn for_people(&self, number: Number) -> Number {
         let Number::Real(value) = number else { return number };
-        if is_integer(value) {
-            return number;
+        // A factor may lead out of the small float's range.
+        let is_near = |shortest: &f64| (shortest - value).abs() <= value.abs() / 1e3;
+        match self.fewest_digits(value).filter(is_near) {
+            Some(shortest) => Number::Real(shortest),
+            None if is_integer(value) => number,
+            None => number.for_people(),
         }
-        let shortest = match self.kind {
-            ValueKind::Single => (value as f32).to_string().parse().ok(),
+    }
+
+    /// A physical value of this signal as programs read it: a float of 32 or of 16 bits as the decimal number with the fewest digits
+    /// that reads back as the same float (0.1 on the bus is 0.10000000149011612 as a double). Any other number stays exact, also
+    /// one of such a float with a factor or an offset.
+    #[must_use]
+    pub fn for_programs(&self, number: Number) -> Number {
+        match number {
+            Number::Real(value) if self.factor.to_bits() == 1.0_f64.to_bits() && self.offset == 0.0 => {
+                Number::Real(self.fewest_digits(value).unwrap_or(value))
+            }
+            _ => number,
+        }
+    }
+
+    /// The decimal number with the fewest digits that is the same as `value` in a signal's float of 32 or of 16 bits; `None` if it is
+    /// no such float, or if it is an integer, of which all digits count.
+    fn fewest_digits(&self, value: f64) -> Option<f64> {
+        match self.kind {
+            _ if is_integer(value) => None,
+            ValueKind::Single => Some(shortest_of_f32(value as f32)),
             ValueKind::Half => (0..5).find_map(|digits| {
                 let shorter: f64 = format!("{value:.digits$e}").parse().ok()?;
                 (half::f16::from_f64(shorter) == half::f16::from_f64(value)).then_some(shorter)
             }),
             _ => None,
-        };
-        // A factor may lead out of the small float's range.
-        let is_near = |shortest: &f64| (shortest - value).abs() <= value.abs() / 1e3;
-        shortest.filter(is_near).map_or(number.for_people(), Number::Real)
+        }
     }
 
     /// The key of the raw bits in the value table: the integer that they represent, before factor and offset.
@@ -487,6 +507,30 @@ mod tests {
         assert!(shown(&far, 0.1).ends_with("e299"));
         let double = Signal { kind: ValueKind::Double, ..Signal::new("D", 0, 64) };
         assert_eq!(double.for_people(Number::Real(0.123_456_789_012)).to_string(), "0.123456789012");
+    }
+
+    #[test]
+    fn programs_get_the_shortest_text_that_reads_back_as_the_same_float() {
+        let single = Signal { kind: ValueKind::Single, ..Signal::new("F", 0, 32) };
+        let written = |signal: &Signal, raw: u32| signal.for_programs(signal.number(raw.into())).to_string();
+        for value in [0.1, 3.3, 1e-30, 1e30, 16_777_216.0, 123_456_790.0, f32::MIN_POSITIVE, f32::MAX] {
+            let text = written(&single, value.to_bits());
+            assert_eq!(text.parse::<f32>().unwrap().to_bits(), value.to_bits(), "{text}");
+            // Programs read a double and may make it a float again.
+            assert_eq!((text.parse::<f64>().unwrap() as f32).to_bits(), value.to_bits(), "{text}");
+        }
+        assert_eq!(
+            [0.1_f32, -12.75, 0.0, f32::NAN].map(|value| written(&single, value.to_bits())),
+            ["0.1", "-12.75", "0", "NaN"]
+        );
+        let half = Signal { kind: ValueKind::Half, ..Signal::new("H", 0, 16) };
+        assert_eq!(written(&half, half::f16::from_f32(0.1).to_bits().into()), "0.1");
+        // What is no such float itself is exact.
+        let scaled = Signal { factor: 0.01, ..single };
+        assert_eq!(written(&scaled, 0.1_f32.to_bits()), Number::Real(f64::from(0.1_f32) * 0.01).to_string());
+        let double = Signal { kind: ValueKind::Double, ..Signal::new("D", 0, 64) };
+        let exact = 0.1 + 0.2;
+        assert_eq!(double.for_programs(double.number(f64::to_bits(exact))), Number::Real(exact));
     }
 
     #[test]

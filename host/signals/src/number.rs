@@ -40,6 +40,15 @@ impl Number {
     }
 }
 
+/// The number that a float of 32 bits is written as: the double whose shortest text is also the shortest that reads back as the same
+/// float, 0.1 instead of 0.10000000149011612. Integers and what is no number stay as they are.
+pub fn shortest_of_f32(value: f32) -> f64 {
+    if value.fract() == 0.0 && value.abs() <= 1e16 {
+        return value.into();
+    }
+    value.to_string().parse().unwrap_or_else(|_| value.into())
+}
+
 impl fmt::Display for Number {
     /// The shortest decimal that reads back as the same value; if finite, it is also a JSON number.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -45,6 +45,11 @@ impl<'a> Reading<'a> {
         }
     }
 
+    /// [`Self::number`] as programs read it in a text ([`Signal::for_programs`]).
+    pub fn number_for_programs(&self) -> Option<Number> {
+        self.number.map(|number| self.signal.for_programs(number))
+    }
+
     /// The value table's text, or what replaces a value.
     pub fn text_or_indicator(&self) -> Option<&'a str> {
         self.text.or(self.indicator)

@@ -30,6 +30,9 @@ pub struct Filter {
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum ParseFilterError {
+    /// Nothing, or commas alone.
+    #[error("a filter is empty; write any for all frames, an ID, such as 123, or an interface, such as can0")]
+    Empty,
     /// The part before the first comma.
     #[error(
         "'{0}' is neither an ID, such as 123, 123:7FF or 09F80102, nor an interface, such as can0 for channel 1, can1 for channel 2, \
@@ -140,6 +143,10 @@ impl FromStr for Filter {
     /// The interface may be left out: `123:7FF` applies to every channel. So may the mask: `123` is that identifier
     /// alone. Identifiers are those of [`grammar::IdPattern`].
     fn from_str(text: &str) -> Result<Self, Self::Err> {
+        // What a script makes of a variable that is not set must not mean everything; `any` does.
+        if text.split(',').all(|part| part.trim().is_empty()) {
+            return Err(ParseFilterError::Empty);
+        }
         let mut filter = Self::default();
         let mut has_several = None;
         for (at, part) in text.split(',').enumerate() {
@@ -239,9 +246,13 @@ mod tests {
         assert!(accepts("0x120:0x7F0", "12A#") && !accepts("can0,100-1FF,200", "201#"));
         // A block is one filter; other ranges are several, which cannot all match.
         assert!(accepts("100-1FF,j", "17A#") && "100-1FE,j".parse::<Filter>().is_err());
-        for text in ["800", "3FFFFFFF", "123456789", "12g", ","] {
-            assert!(text.parse::<Filter>().is_err() || text == ",", "{text}");
+        for text in ["800", "3FFFFFFF", "123456789", "12g"] {
+            assert!(text.parse::<Filter>().is_err(), "{text}");
         }
+        for text in ["", " ", ",", ",,", " , "] {
+            assert_eq!(text.parse::<Filter>(), Err(ParseFilterError::Empty), "'{text}'");
+        }
+        assert!(accepts("any", "123#") && accepts(",123", "123#"));
     }
 
     /// The examples of candump's own help.

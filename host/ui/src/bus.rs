@@ -51,7 +51,8 @@ impl Bus {
     /// Opens the devices and begins the recording, if one is requested.
     pub fn open(device: Device, reporter: Reporter, visits: Visits) -> anyhow::Result<Self> {
         device.open.timing.check_channels(device.boards.addresses().len())?;
-        let begin = |text: &PathBuf| Recording::create_by_text(text, &device.decoder, Older::Refuse);
+        let begin =
+            |text: &PathBuf| Recording::create_by_text(text, &device.decoder, Older::Refuse, Vec::new());
         let recording = device.record.as_ref().map(begin).transpose()?;
         let state = State {
             may_send: device.role >= Role::Send,

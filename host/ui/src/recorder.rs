@@ -22,7 +22,7 @@ pub fn create(
     decoder: &Decoder,
 ) -> anyhow::Result<Recording> {
     let path = folder.join(checked(name)?);
-    Recording::create(&path, only.map(|only| around(only, decoder)).transpose()?, Older::Refuse)
+    Recording::create(&path, only.map(|only| around(only, decoder)).transpose()?, Older::Refuse, Vec::new())
 }
 
 fn around(only: &Only, decoder: &Decoder) -> anyhow::Result<Around> {

@@ -4,7 +4,7 @@ use std::fs::OpenOptions;
 use std::path::{Path, PathBuf};
 
 use anyhow::{anyhow, bail};
-use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_formats::{ChannelInfo, Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::Decoder;
 use cantap_signals::trigger::{Trigger, TriggerCounts, Window};
 use cantap_trace::TraceRecord;
@@ -63,6 +63,8 @@ pub struct Recording {
     records: u64,
     since_ns: i64,
     around: Option<Around>,
+    /// What is known of the channels, for formats that have a place for it.
+    channels: Vec<ChannelInfo>,
 }
 
 /// How far a recording is.
@@ -86,16 +88,21 @@ pub struct RecordingState {
 
 impl Recording {
     /// Creates the file, in the format of its suffix. With a condition, only the records around its events are written, and the file begins
-    /// with the first of them.
+    /// with the first of them. `channels` is what is known of the channels, as for [`WriteOptions::channels`].
     ///
     /// # Errors
     /// What prevents it; with a condition, also what would prevent it later.
-    pub fn create(path: &Path, around: Option<Around>, older: Older) -> anyhow::Result<Self> {
+    pub fn create(
+        path: &Path,
+        around: Option<Around>,
+        older: Older,
+        channels: Vec<ChannelInfo>,
+    ) -> anyhow::Result<Self> {
         // Before anything is created, whether its suffix names a format.
         Format::of_path(path).map_err(|error| cannot(path, &advice::explained(&error)))?;
         let older = if path.exists() { older } else { Older::Refuse };
         let writer = if around.is_none() {
-            Some(create_file(path, older)?)
+            Some(create_file(path, older, &channels)?)
         } else {
             // Whether it could be created, without leaving one.
             if older == Older::Refuse {
@@ -104,17 +111,40 @@ impl Recording {
             }
             None
         };
-        Ok(Self { path: path.to_owned(), writer, older, records: 0, since_ns: 0, around })
+        Ok(Self { path: path.to_owned(), writer, older, records: 0, since_ns: 0, around, channels })
     }
 
     /// The same by a text: the file's name may be followed by a condition, as in `fast.blf if Speed > 80`.
     ///
     /// # Errors
     /// As above.
-    pub fn create_by_text(text: &Path, decoder: &Decoder, older: Older) -> anyhow::Result<Self> {
+    pub fn create_by_text(
+        text: &Path,
+        decoder: &Decoder,
+        older: Older,
+        channels: Vec<ChannelInfo>,
+    ) -> anyhow::Result<Self> {
         let (path, condition) = parts(text);
         let around = condition.map(|condition| Around::new(condition, WINDOW, decoder)).transpose()?;
-        Self::create(path, around, older)
+        Self::create(path, around, older, channels)
+    }
+
+    /// Checks such a text without creating anything.
+    ///
+    /// # Errors
+    /// What is wrong with the condition, the file's suffix or its folder, or that the file is there already.
+    pub fn check_text(text: &Path, decoder: &Decoder) -> anyhow::Result<()> {
+        let (path, condition) = parts(text);
+        if path.exists() {
+            bail!("{} already exists; choose another name, or remove it first", path.display());
+        }
+        Format::of_path(path).map_err(|error| cannot(path, &advice::explained(&error)))?;
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+            return Err(cannot(path, &format!("there is no folder {}", folder.display())));
+        }
+        condition.map(|condition| Around::new(condition, WINDOW, decoder)).transpose()?;
+        Ok(())
     }
 
     /// Writes records.
@@ -122,11 +152,11 @@ impl Recording {
     /// # Errors
     /// If the disk takes no more, or if somebody else has created the file while the condition was awaited.
     pub fn write(&mut self, records: &[TraceRecord]) -> anyhow::Result<()> {
-        let Self { path, writer, older, around, records: count, since_ns } = self;
+        let Self { path, writer, older, around, records: count, since_ns, channels } = self;
         let mut keep = |record: &TraceRecord| -> anyhow::Result<()> {
             let writer = match writer {
                 Some(writer) => writer,
-                None => writer.insert(create_file(path, *older)?),
+                None => writer.insert(create_file(path, *older, channels)?),
             };
             if *count == 0 {
                 *since_ns = record.time_ns;
@@ -217,17 +247,19 @@ fn reserve(path: &Path) -> anyhow::Result<()> {
     }
 }
 
-fn create_file(path: &Path, older: Older) -> anyhow::Result<Box<dyn TraceWriter>> {
+fn create_file(path: &Path, older: Older, channels: &[ChannelInfo]) -> anyhow::Result<Box<dyn TraceWriter>> {
     if older == Older::Refuse {
         reserve(path)?;
     }
-    create_writer(path, &WriteOptions::default()).map_err(|error| {
-        if older == Older::Refuse {
-            // It is empty, and this program's.
-            let _ = std::fs::remove_file(path);
-        }
-        cannot(path, &advice::explained(&error))
-    })
+    create_writer(path, &WriteOptions { channels: channels.to_vec(), ..WriteOptions::default() }).map_err(
+        |error| {
+            if older == Older::Refuse {
+                // It is empty, and this program's.
+                let _ = std::fs::remove_file(path);
+            }
+            cannot(path, &advice::explained(&error))
+        },
+    )
 }
 
 fn listed(left_out: &LeftOut, forgotten: u64) -> Vec<String> {
@@ -257,7 +289,7 @@ mod tests {
     fn everything_is_in_a_new_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("drive.log");
-        let mut recording = Recording::create(&path, None, Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, None, Older::Refuse, Vec::new()).unwrap();
         recording.write(&[frame(3, "123#00"), frame(4, "123#01")]).unwrap();
         let state = recording.state().unwrap();
         assert_eq!((state.path, state.records, state.since_ns), (path.clone(), 2, 3_000_000_000));
@@ -265,16 +297,17 @@ mod tests {
         let text = std::fs::read_to_string(&path).unwrap();
         assert_eq!(text.lines().count(), 2);
         for around in [None, Some(fast())] {
-            let error = Recording::create(&path, around, Older::Refuse).err().unwrap().to_string();
+            let error =
+                Recording::create(&path, around, Older::Refuse, Vec::new()).err().unwrap().to_string();
             assert!(error.contains("is not overwritten"), "{error}");
             assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
         }
-        let mut recording = Recording::create(&path, Some(fast()), Older::Replace).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Replace, Vec::new()).unwrap();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), text);
         recording.write(&[frame(5, "123#FF")]).unwrap();
         recording.finish();
         assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 1);
-        Recording::create(&path, None, Older::Replace).unwrap().finish();
+        Recording::create(&path, None, Older::Replace, Vec::new()).unwrap().finish();
         assert_eq!(std::fs::read_to_string(&path).unwrap(), "");
     }
 
@@ -282,7 +315,7 @@ mod tests {
     fn only_what_is_around_an_event_is_recorded_where_a_condition_is_given() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("fast.log");
-        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse, Vec::new()).unwrap();
         for second in 0..30 {
             recording.write(&[frame(second, if second == 15 { "123#FF" } else { "123#01" })]).unwrap();
         }
@@ -296,7 +329,7 @@ mod tests {
     fn a_condition_that_never_comes_true_leaves_no_file_and_is_awaited() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("never.log");
-        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse, Vec::new()).unwrap();
         recording.write(&[frame(0, "123#01"); 5]).unwrap();
         let state = recording.state().unwrap();
         assert_eq!((state.condition.as_deref(), state.records, state.events), (Some("byte[0] > 0x80"), 0, 0));
@@ -310,11 +343,12 @@ mod tests {
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
         // What would prevent it later is an error at once, and a file of somebody else is not overwritten later.
         for place in ["no-folder/a.log", "a.unknown"] {
-            let error = Recording::create(&folder.path().join(place), Some(fast()), Older::Refuse);
+            let error =
+                Recording::create(&folder.path().join(place), Some(fast()), Older::Refuse, Vec::new());
             let error = error.err().unwrap().to_string();
             assert!(error.starts_with("cannot record to "), "{error}");
         }
-        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse).unwrap();
+        let mut recording = Recording::create(&path, Some(fast()), Older::Refuse, Vec::new()).unwrap();
         std::fs::write(&path, "somebody's").unwrap();
         let error = recording.write(&[frame(0, "123#FF")]).unwrap_err();
         assert!(Recording::failure(&error).contains("is not overwritten"), "{error}");
@@ -325,8 +359,9 @@ mod tests {
     fn a_name_may_be_followed_by_a_condition() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("fast.log");
-        let begin =
-            |text: &str| Recording::create_by_text(Path::new(text), &Decoder::new(Vec::new()), Older::Refuse);
+        let begin = |text: &str| {
+            Recording::create_by_text(Path::new(text), &Decoder::new(Vec::new()), Older::Refuse, Vec::new())
+        };
         let state = begin(&format!("{} if byte[0] > 0x80", path.display())).unwrap().state().unwrap();
         assert_eq!((state.path, state.condition.as_deref()), (path.clone(), Some("byte[0] > 0x80")));
         assert_eq!(begin(path.to_str().unwrap()).unwrap().state().unwrap().condition, None);
@@ -340,7 +375,30 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let target = folder.path().join("target");
         std::os::unix::fs::symlink(&target, folder.path().join("a.log")).unwrap();
-        assert!(Recording::create(&folder.path().join("a.log"), None, Older::Refuse).is_err());
+        assert!(Recording::create(&folder.path().join("a.log"), None, Older::Refuse, Vec::new()).is_err());
         assert!(!target.exists());
+    }
+
+    #[test]
+    fn what_would_be_refused_is_known_before_and_a_recording_keeps_the_bit_rates() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |text: &str| folder.path().join(text);
+        let decoder = Decoder::new(Vec::new());
+        let refused = |text: &str| Recording::check_text(&at(text), &decoder).unwrap_err().to_string();
+        assert!(
+            refused("a.blf if Speed >").contains("nothing is recorded"),
+            "{}",
+            refused("a.blf if Speed >")
+        );
+        assert!(refused("nowhere/a.blf").contains("there is no folder"));
+        assert!(refused("a.nothing").contains("a.nothing"));
+        std::fs::write(at("older.log"), "").unwrap();
+        assert!(refused("older.log if id == 0x123").contains("already exists"));
+        Recording::check_text(&at("a.blf if id == 0x123"), &decoder).unwrap();
+        let channel = ChannelInfo { channel: 2, bitrate_bps: Some(125_000), description: String::new() };
+        let recording = Recording::create(&at("b.asc"), None, Older::Refuse, vec![channel]);
+        recording.unwrap().finish();
+        let text = std::fs::read_to_string(at("b.asc")).unwrap();
+        assert!(text.contains("// cantap: bit-rates 2=125000\n"), "{text}");
     }
 }

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use cantap_signals::named::{NameError, NamedFilter};
-use cantap_work::recording;
+use cantap_work::recording::Recording;
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::{Model, While};
@@ -64,7 +64,7 @@ impl App {
             PromptKind::Open => self.open_file(text, model),
             PromptKind::Device if Self::is_trace(text) => self.open_trace(Path::new(text)),
             PromptKind::Filter => self.set_filters(text, model),
-            PromptKind::Record => self.record(Path::new(text)),
+            PromptKind::Record => self.record(Path::new(text), model),
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::Export => {
                 self.export_list(Path::new(text));
@@ -83,12 +83,9 @@ impl App {
         }
     }
 
-    fn record(&mut self, text: &Path) -> Result<(), String> {
-        let (path, _) = recording::parts(text);
-        if path.exists() {
-            let path = path.display();
-            return Err(format!("{path} already exists; choose another name, or remove it first"));
-        }
+    fn record(&mut self, text: &Path, model: &Model) -> Result<(), String> {
+        // While the line is open: what is refused later is no longer there to be mended.
+        Recording::check_text(text, model.seen.signals.decoder()).map_err(|error| format!("{error:#}"))?;
         self.order(Order::Record(text.to_owned()));
         Ok(())
     }

@@ -18,7 +18,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use cantap::TraceRecord;
-use cantap_formats::IndexFolder;
+use cantap_formats::{ChannelInfo, IndexFolder};
 
 use super::model::Model;
 use super::order::Order;
@@ -104,9 +104,18 @@ impl Source<'_> {
 
     fn record(&mut self, path: &Path) {
         self.stop_recording();
-        let decoder = Arc::clone(lock(self.model).seen.signals.decoder());
+        let (decoder, channels) = {
+            let seen = &lock(self.model).seen;
+            let info = |(channel, bps): &(u8, u32)| ChannelInfo {
+                channel: *channel,
+                bitrate_bps: Some(*bps),
+                description: String::new(),
+            };
+            let known = seen.statistics.channel_bitrates_bps().iter().map(info).collect();
+            (Arc::clone(seen.signals.decoder()), known)
+        };
         // Whether an older file is overwritten, the user has been asked before.
-        match Recording::create_by_text(path, &decoder, Older::Replace) {
+        match Recording::create_by_text(path, &decoder, Older::Replace, channels) {
             Ok(recording) => {
                 self.recording = Some(recording);
                 self.show_recording();

@@ -29,6 +29,8 @@ struct Progress {
     unread: RefCell<Option<(u64, String)>>,
     /// How many of the file's records were read or passed over.
     records: Cell<u64>,
+    /// What the file has said of its channels: from 1, bit/s.
+    bit_rates: RefCell<Vec<(u8, u32)>>,
     /// What is played when the playback starts over, if not all of the file.
     jump: RefCell<Option<Readable>>,
 }
@@ -118,6 +120,10 @@ impl Iterator for Readable {
         loop {
             let record = self.any_next()?;
             self.progress.records.set(self.reader.records());
+            let known = self.reader.bit_rates();
+            if known.len() != self.progress.bit_rates.borrow().len() {
+                known.clone_into(&mut self.progress.bit_rates.borrow_mut());
+            }
             if record.time_ns >= self.from_ns {
                 return Some(record);
             }
@@ -249,6 +255,12 @@ impl Source<'_> {
                 length.look_for(path, self.indexes.as_ref());
             }
             if !due.is_empty() {
+                {
+                    let statistics = &mut lock(self.model).seen.statistics;
+                    for (channel, bps) in progress.bit_rates.borrow().iter() {
+                        statistics.learn_bitrate(*channel, *bps);
+                    }
+                }
                 self.take(&due);
                 due.clear();
             }

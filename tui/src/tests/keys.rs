@@ -108,6 +108,27 @@ fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
 }
 
 #[test]
+fn a_recording_that_is_refused_stays_to_be_mended() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Record);
+    let folder = tempfile::tempdir().unwrap();
+    let text = |name: &str, rest: &str| format!("{}{rest}", folder.path().join(name).display());
+    for refused in [text("a.blf", " if Nothing >"), text("no/a.blf", ""), text("a.nothing", "")] {
+        press(&mut app, &mut model, &format!("r{refused}\n"));
+        assert!(!app.message.is_empty(), "{refused}");
+        assert_eq!(app.prompt.as_ref().map(|prompt| prompt.line.text()), Some(refused));
+        app.prompt = None;
+    }
+    assert!(orders.try_recv().is_err());
+    press(&mut app, &mut model, &format!("r{}\n", text("a.blf", " if id == 0x123")));
+    assert!(
+        app.prompt.is_none() && matches!(orders.try_recv().unwrap(), Order::Record(_)),
+        "{}",
+        app.message
+    );
+}
+
+#[test]
 fn what_is_typed_wrong_is_explained_and_stays_to_be_mended() {
     let mut model = model();
     let (mut app, _orders) = app(View::Send);

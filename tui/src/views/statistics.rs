@@ -3,7 +3,7 @@
 use cantap::Channel;
 use cantap::device::{ClockSource, channel_number};
 use cantap::wire::record::{BusErrorKind, LossStage};
-use cantap_analysis::stats::ChannelStatistics;
+use cantap_analysis::stats::{ChannelStatistics, is_of_a_part};
 use cantap_work::bus_hints::{BusHint, HintPlace};
 use cantap_work::channels::place_of;
 use ratatui::Frame;
@@ -14,6 +14,7 @@ use super::super::app::App;
 use super::super::cut::draw_lines;
 use super::super::model::{DeviceFigures, Model, Seen, SourceState};
 use super::super::theme::Theme;
+use super::super::times::duration;
 use super::bottom::wrapped;
 use super::list::bytes;
 
@@ -73,7 +74,9 @@ fn channel_lines(
     lines: &mut Vec<Line<'static>>,
 ) {
     let theme = app.theme;
-    let rate = channel.bitrate_bps.map_or("bit rate unknown (-b)".to_owned(), |rate| format!("{rate} bit/s"));
+    let from = if seen.statistics.is_learned(channel.number) { ", as the trace says" } else { "" };
+    let rate =
+        channel.bitrate_bps.map_or("bit rate unknown (-b)".to_owned(), |rate| format!("{rate} bit/s{from}"));
     let state = channel.state.map_or(String::new(), |state| format!(", {}", state.name()));
     let counters = channel.counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"));
     lines.push(
@@ -82,7 +85,8 @@ fn channel_lines(
     let windows = seen.loads.iter().find(|(number, _)| *number == channel.number).map(|(_, windows)| windows);
     let latest = windows.and_then(|windows| windows.back());
     if let Some(load) = latest.and_then(|window| window.load_pct) {
-        lines.push(gauge(load, GAUGE_COLUMNS[usize::from(width >= 110)], channel, app));
+        let observed_ns = seen.statistics.observed_ns();
+        lines.push(gauge(load, GAUGE_COLUMNS[usize::from(width >= 110)], channel, observed_ns, app));
     }
     let (frames_per_s, bits_per_s) =
         latest.map_or((0.0, 0.0), |window| (window.frames_per_s(), window.bits_per_s()));
@@ -168,13 +172,26 @@ fn hint_lines(
 }
 
 /// A bar for the load, with current, mean and peak load as figures.
-fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> Line<'static> {
+fn gauge(
+    load: f64,
+    columns: usize,
+    channel: &ChannelStatistics,
+    observed_ns: u64,
+    app: &App,
+) -> Line<'static> {
     let (full, empty) = if app.theme.unicode { ('█', '░') } else { ('#', '.') };
     let filled = ((load * columns as f64 / 100.0).round() as usize).min(columns);
     let bar: String = (0..columns).map(|column| if column < filled { full } else { empty }).collect();
     let percent = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1} %"));
     let work = channel.load.as_ref();
     let peak = channel.window_largest_pct();
+    // The mean of a bus that stopped is of the time before.
+    let covered_ns = channel.covered_ns();
+    let over = if is_of_a_part(covered_ns as f64, observed_ns as f64) {
+        format!(" over {}", duration(covered_ns as i64))
+    } else {
+        String::new()
+    };
     // It does not include lost frames.
     let bound = match (channel.losses.total(), app.theme.unicode) {
         (0, _) => "",
@@ -185,7 +202,7 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
         Span::raw("Load      "),
         Span::styled(bar, app.theme.load(load)),
         Span::raw(format!(
-            " {bound}{load:.1} %  instant {}  mean {}  peak {}",
+            " {bound}{load:.1} %  instant {}  mean {}{over}  peak {}",
             percent(work.and_then(cantap_analysis::stats::WorkLoad::instant_pct)),
             percent(work.and_then(cantap_analysis::stats::WorkLoad::mean_pct)),
             percent(peak)

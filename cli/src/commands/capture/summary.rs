@@ -6,6 +6,7 @@ use std::path::Path;
 use cantap::Device;
 use cantap::device::{Gaps, channel_number};
 use cantap_address::Address;
+use cantap_analysis::stats::is_of_a_part;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
 use cantap_work::boards::Boards;
@@ -25,6 +26,8 @@ pub struct ChannelSummary {
     pub bus_errors: u64,
     /// `null` if the device left out what is needed for it, like the next one.
     frames_per_s: Option<f64>,
+    /// The time that rate and load are over.
+    duration_s: f64,
     bus_load_pct: Option<f64>,
     /// If it is not known, the reason.
     no_bus_load_because: Option<&'static str>,
@@ -131,7 +134,7 @@ impl Summary {
         }
         eprintln!("captured {} s", self.seconds);
         for channel in &self.channels {
-            eprintln!("{}", channel.line());
+            eprintln!("{}", channel.line(self.seconds));
         }
         if let Some(TriggerSummary { events, kept, forgotten }) = &self.trigger {
             eprintln!("trigger: {events} events, {kept} records kept");
@@ -242,14 +245,15 @@ impl ChannelSummary {
             lost_at_least: meter.lost_at_least(),
             bus_errors: meter.bus_errors(),
             frames_per_s: meter.frames_per_s().map(|rate| rounded(rate, 1)),
+            duration_s: rounded(meter.seconds(), 6),
             bus_load_pct: meter.bus_load_pct().map(|load| rounded(load, 2)),
             no_bus_load_because: meter.no_bus_load_because(),
             hint: hint.map(BusHint::name),
         }
     }
 
-    /// One line; what is unknown has its reason.
-    fn line(&self) -> String {
+    /// One line; what is unknown has its reason. The capture lasted `seconds`.
+    fn line(&self, seconds: f64) -> String {
         let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct, .. } = self;
         let lost = lost_frames(*lost, self.lost_at_least);
         let rate = frames_per_s.map_or_else(String::new, |rate| format!(", {rate} frames/s"));
@@ -258,6 +262,12 @@ impl ChannelSummary {
             (None, Some(reason)) => format!(", bus load – ({reason})"),
             (None, None) => String::new(),
         };
-        format!("channel {channel}: {frames} frames{rate}{load}, {lost} lost, {bus_errors} bus errors")
+        // A bus that stopped was not as busy all the time.
+        let over = if is_of_a_part(self.duration_s, seconds) && !(rate.is_empty() && load.is_empty()) {
+            format!(" (over {:.1} s from the first frame to the last)", self.duration_s)
+        } else {
+            String::new()
+        };
+        format!("channel {channel}: {frames} frames{rate}{load}{over}, {lost} lost, {bus_errors} bus errors")
     }
 }

@@ -25,7 +25,7 @@ pub fn write(out: &mut impl Write, decoded: &Decoded, cells: Cells) -> io::Resul
             cells.field(&message.name),
             cells.field(&reading.label),
         )?;
-        if let Some(number) = reading.number {
+        if let Some(number) = reading.number_for_programs() {
             write!(out, "{number}")?;
         }
         write!(

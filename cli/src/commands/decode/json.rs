@@ -32,7 +32,7 @@ pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Resu
         }
         serde_json::to_writer(&mut *out, &reading.label)?;
         out.write_all(if details { b":{\"value\":" } else { b":" })?;
-        match reading.number.filter(|number| number.is_finite()) {
+        match reading.number_for_programs().filter(|number| number.is_finite()) {
             Some(number) => write!(out, "{number}")?,
             None => out.write_all(b"null")?,
         }

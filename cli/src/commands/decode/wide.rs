@@ -116,7 +116,7 @@ impl Wide {
         for value in decoded.values {
             let reading = Reading::of(decoded.message, value);
             let place = self.place(decoded, value.signal, &reading);
-            let number = reading.number.filter(|number| number.is_finite());
+            let number = reading.number_for_programs().filter(|number| number.is_finite());
             let column = &mut self.columns[place];
             column.cadence.arrive(time_ns);
             let text = number.map(|number| number.to_string()).unwrap_or_default();

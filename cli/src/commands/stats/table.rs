@@ -3,7 +3,7 @@
 use cantap_trace::{BusErrorKind, LossStage};
 use std::fmt::Write as _;
 
-use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
+use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary, is_of_a_part};
 
 use cantap_work::lost_frames;
 use cantap_work::missing::Missing;
@@ -44,7 +44,8 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let _ = match channel.bitrate {
         Some(bitrate) => {
             let data = channel.data_bitrate.map_or(String::new(), |data| format!(", data at {data} bit/s"));
-            writeln!(out, "\nChannel {} at {bitrate} bit/s{data}", channel.channel)
+            let from = if channel.bitrate_from_trace { ", as the trace says" } else { "" };
+            writeln!(out, "\nChannel {} at {bitrate} bit/s{from}{data}", channel.channel)
         }
         None => {
             writeln!(out, "\nChannel {}, bit rate unknown: give it with -b for the load", channel.channel)
@@ -86,9 +87,15 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
         let bound =
             if channel.lost.total > 0 { ", without the windows from which frames are missing" } else { "" };
+        // A bus that stopped was not as busy all the time.
+        let over = if is_of_a_part(channel.duration_s, summary.observed_s) {
+            format!(" over {:.3} s of {:.3} s", channel.duration_s, summary.observed_s)
+        } else {
+            String::new()
+        };
         let _ = writeln!(
             out,
-            "  load      mean {}, last {}, highest between two frames {}",
+            "  load      mean {}{over}, last {}, highest between two frames {}",
             percent(load.mean_pct),
             percent(load.instant_pct),
             percent(load.instant_max_pct),

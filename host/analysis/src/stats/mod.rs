@@ -16,7 +16,9 @@ use cantap_trace::TraceRecord;
 
 pub use channel::{ChannelStatistics, Errors, Losses};
 pub use ids::{IdStatistics, MOST_IDS, Period};
-pub use summary::{ChannelSummary, ErrorSummary, IdSummary, LoadSummary, LossSummary, PeakSummary, Summary};
+pub use summary::{
+    ChannelSummary, ErrorSummary, IdSummary, LoadSummary, LossSummary, PeakSummary, Summary, is_of_a_part,
+};
 pub use windows::{ERROR_FRAME_BITS, Window, shortest_window_ns};
 pub use work_load::WorkLoad;
 
@@ -119,6 +121,8 @@ pub struct Statistics {
     /// Index in `channels` for the previous record, nearly always that of the current one or of the other
     /// channel.
     latest: usize,
+    /// Channels, from 1, whose bit rate the trace has said.
+    learned: Vec<u8>,
 }
 
 impl Statistics {
@@ -149,7 +153,15 @@ impl Statistics {
         if window_ns < shortest_ns {
             return Err(BadOptions::WindowTooShort { bitrate_bps, shortest_us: shortest_ns.div_ceil(1000) });
         }
-        Ok(Self { options, window_ns, first_ns: None, last_ns: i64::MIN, channels: Vec::new(), latest: 0 })
+        Ok(Self {
+            options,
+            window_ns,
+            first_ns: None,
+            last_ns: i64::MIN,
+            channels: Vec::new(),
+            latest: 0,
+            learned: Vec::new(),
+        })
     }
 
     /// Takes the next record of the trace.
@@ -177,7 +189,18 @@ impl Statistics {
         let is_possible = bitrate_bps > 0 && self.window_ns >= shortest_window_ns(bitrate_bps);
         if is_possible && self.options.bitrate_of(channel).is_none() {
             self.options.channel_bitrate_bps.push((channel, bitrate_bps));
+            self.learned.push(channel);
         }
+    }
+
+    /// The bit rates of individual channels, those that the trace has said included: channel from 1, bit/s.
+    pub fn channel_bitrates_bps(&self) -> &[(u8, u32)] {
+        &self.options.channel_bitrate_bps
+    }
+
+    /// Whether a channel's bit rate is one that the trace has said ([`Self::learn_bitrate`]).
+    pub fn is_learned(&self, channel: u8) -> bool {
+        self.learned.contains(&channel)
     }
 
     /// The channel's index; it is added if necessary.
@@ -246,6 +269,12 @@ impl Statistics {
     /// One channel, if it had any record.
     pub fn channel(&self, number: u8) -> Option<&ChannelStatistics> {
         self.channels.iter().find(|channel| channel.number == number)
+    }
+
+    /// How long was watched, in nanoseconds: from where the windows begin to the latest record or [`Self::advance_with`].
+    pub fn observed_ns(&self) -> u64 {
+        let since = self.first_ns.map_or(0, |first| self.last_ns.saturating_sub(first));
+        u64::try_from(since).unwrap_or(0)
     }
 
     /// Time of the latest record, in nanoseconds as in [`TraceRecord::time_ns`]; `None` before the first.

@@ -28,10 +28,18 @@ pub struct Summary {
     pub origin_s: Option<f64>,
     /// Between the first and the last frame, in seconds.
     pub duration_s: f64,
+    /// From where the windows begin to the latest record, or as long as a device was listened to, in seconds.
+    pub observed_s: f64,
     /// Length of a window, in seconds.
     pub window_s: f64,
     /// The channels, in ascending order.
     pub channels: Vec<ChannelSummary>,
+}
+
+/// Whether rates that are over the time from the first frame to the last leave much out of the time that was watched, as when a bus
+/// stopped: then the time belongs beside them. Both times have the same unit.
+pub fn is_of_a_part(frames_over: f64, observed: f64) -> bool {
+    frames_over > 0.0 && frames_over < 0.9 * observed
 }
 
 /// Statistics of one channel.
@@ -42,6 +50,8 @@ pub struct ChannelSummary {
     /// Its bit rate in bit/s, if given.
     #[serde(rename = "bitrate_bps")]
     pub bitrate: Option<u32>,
+    /// Whether the trace itself has said it.
+    pub bitrate_from_trace: bool,
     /// The bit rate of its data phases in bit/s, if given.
     #[serde(rename = "data_bitrate_bps")]
     pub data_bitrate: Option<u32>,
@@ -236,7 +246,8 @@ impl Summary {
             .iter()
             .map(|channel| {
                 let why_without_load = statistics.options.why_without_load(channel.number);
-                ChannelSummary::of(channel, statistics.window_ns, why_without_load)
+                let summary = ChannelSummary::of(channel, statistics.window_ns, why_without_load);
+                ChannelSummary { bitrate_from_trace: statistics.is_learned(channel.number), ..summary }
             })
             .collect();
         channels.sort_by_key(|channel| channel.channel);
@@ -256,6 +267,7 @@ impl Summary {
             last_ns: last,
             origin_s: statistics.first_ns.map(seconds),
             duration_s: longest,
+            observed_s: statistics.observed_ns() as f64 / 1e9,
             window_s: statistics.window_ns as f64 / 1e9,
             channels,
         }
@@ -284,6 +296,7 @@ impl ChannelSummary {
         Self {
             channel: channel.number,
             bitrate: channel.bitrate_bps,
+            bitrate_from_trace: false,
             data_bitrate: channel.data_bitrate_bps,
             frames: channel.frames,
             sent: channel.sent,

@@ -240,3 +240,35 @@ fn the_first_and_last_time_are_told_to_the_nanosecond() {
     let nearest: f64 = "1800000000.123456789".parse().unwrap();
     assert!((summary.first_s.unwrap() - nearest).abs() <= 2.5e-7, "{:?}", summary.first_s);
 }
+
+#[test]
+fn a_bus_that_stopped_has_its_load_over_a_part_of_what_was_watched() {
+    let mut statistics =
+        Statistics::new(Options { bitrate_bps: Some(500_000), ..Options::default() }).unwrap();
+    for n in 0..11 {
+        statistics.push(&frame(n * 200_000, 1, "123#11"));
+    }
+    let summary = statistics.summary();
+    assert!(!is_of_a_part(summary.channels[0].duration_s, summary.observed_s), "{}", summary.observed_s);
+    // Nothing came for eight seconds.
+    statistics.advance_with(10_000_000_000, |_| {});
+    let summary = statistics.summary();
+    assert!((summary.channels[0].duration_s - 2.0).abs() < 1e-9);
+    assert!((summary.observed_s - 10.0).abs() < 0.001, "{}", summary.observed_s);
+    assert!(is_of_a_part(summary.channels[0].duration_s, summary.observed_s));
+    assert!(!is_of_a_part(0.0, 10.0), "there is no load of no time");
+}
+
+#[test]
+fn a_bit_rate_that_the_trace_says_is_known_as_such() {
+    let mut statistics = Statistics::new(Options::default()).unwrap();
+    statistics.learn_bitrate(1, 500_000);
+    statistics.push(&frame(0, 1, "123#11"));
+    let channel = &statistics.summary().channels[0];
+    assert_eq!((channel.bitrate, channel.bitrate_from_trace), (Some(500_000), true));
+    let mut given = Statistics::new(Options { bitrate_bps: Some(250_000), ..Options::default() }).unwrap();
+    given.learn_bitrate(1, 500_000);
+    given.push(&frame(0, 1, "123#11"));
+    let channel = &given.summary().channels[0];
+    assert_eq!((channel.bitrate, channel.bitrate_from_trace), (Some(250_000), false));
+}

@@ -78,7 +78,7 @@ impl<W: Write> McapFile<W> {
         for value in values {
             let reading = Reading::of(message, value);
             let fields = &topic.signals[value.signal as usize];
-            if let Some(number) = reading.number.filter(|number| number.is_finite()) {
+            if let Some(number) = reading.number_for_programs().filter(|number| number.is_finite()) {
                 write!(object, ",{}:{number}", fields.value)?;
             }
             if let (Some(name), Some(text)) = (&fields.text, reading.text) {

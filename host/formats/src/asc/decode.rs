@@ -4,6 +4,7 @@ use std::io;
 
 use cantap_can::{Frame, Id};
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::codec::{Decode, REQUESTS_TO_SEND};
 use super::super::event_text;
 use super::super::found::Found;
@@ -35,6 +36,7 @@ pub(crate) struct Decoder {
     base_ns: Option<i64>,
     /// The zone of the dates.
     zone: Zone,
+    bit_rates: BitRates,
 }
 
 /// Whether `line` begins with `word`, in any case.
@@ -55,14 +57,18 @@ impl Decoder {
 }
 
 impl Decode for Decoder {
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
+    }
+
     fn save(&self, state: &mut Vec<u8>) -> bool {
-        let Self { decimal, relative, date_ns, block_ns, blocks, base_ns, zone: _ } = self;
-        seek::save(&(decimal, relative, date_ns, block_ns, blocks, base_ns), state)
+        let Self { decimal, relative, date_ns, block_ns, blocks, base_ns, zone: _, bit_rates } = self;
+        seek::save(&(decimal, relative, date_ns, block_ns, blocks, base_ns, bit_rates), state)
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
-        (self.decimal, self.relative, self.date_ns, self.block_ns, self.blocks, self.base_ns) =
-            seek::load(state)?;
+        let Self { decimal, relative, date_ns, block_ns, blocks, base_ns, zone: _, bit_rates } = self;
+        (*decimal, *relative, *date_ns, *block_ns, *blocks, *base_ns, *bit_rates) = seek::load(state)?;
         Some(())
     }
 
@@ -119,8 +125,9 @@ impl Decoder {
                 self.block_ns = Some(date(stamp, &self.zone)?);
                 return Ok(note(stamp));
             }
+        } else if line.starts_with(b"//") {
+            bit_rates::learn_note(&mut self.bit_rates, line);
         } else if !(line.is_empty()
-            || line.starts_with(b"//")
             || begins(line, "internal events")
             || begins(line, "no internal events")
             || begins(line, "end triggerblock"))

@@ -2,6 +2,7 @@
 
 use cantap_can::Frame;
 
+use super::super::bit_rates;
 use super::super::calendar::{DAYS, Date, MONTHS, start_of_trace};
 use super::super::codec::Encode;
 use super::super::event_text;
@@ -9,6 +10,7 @@ use super::super::left_out::LeftOut;
 use super::super::line::{Line, Seconds};
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
+use super::super::writer::WriteOptions;
 use super::super::zone::Zone;
 use super::{FD_FORMAT, PASSIVE_SENDER, STATES, SWITCHED_BIT_RATE};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -20,12 +22,14 @@ pub(crate) struct Encoder {
     seconds: Seconds<SECONDS_WIDTH>,
     /// The zone of the dates.
     zone: Zone,
+    /// What is known of the channels' bit rates.
+    note: Option<String>,
 }
 
 impl Encoder {
-    /// `zone` is the zone of the file's dates.
-    pub(crate) fn new(zone: &Zone) -> Self {
-        Self { start_ns: None, seconds: Seconds::new(), zone: zone.clone() }
+    pub(crate) fn new(options: &WriteOptions) -> Self {
+        let note = bit_rates::note(&bit_rates::known(&options.channels));
+        Self { start_ns: None, seconds: Seconds::new(), zone: options.zone.clone(), note }
     }
 }
 
@@ -58,7 +62,11 @@ impl Encoder {
         out.extend_from_slice(b"date ");
         let clock_ns = self.zone.clock_ns(start_ns);
         push_date(out, clock_ns);
-        out.extend_from_slice(b"base hex  timestamps absolute\ninternal events logged\nBegin Triggerblock ");
+        out.extend_from_slice(b"base hex  timestamps absolute\n");
+        if let Some(note) = &self.note {
+            out.extend_from_slice(format!("// {note}\n").as_bytes());
+        }
+        out.extend_from_slice(b"internal events logged\nBegin Triggerblock ");
         push_date(out, clock_ns);
         out.extend_from_slice(b"   0.000000 Start of measurement\n");
         start_ns

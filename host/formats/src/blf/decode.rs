@@ -4,6 +4,7 @@ use std::io;
 
 use flate2::Decompress;
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::calendar::Date;
 use super::super::codec::{BATCH, Decode, PLAIN_BATCH, REQUESTS_TO_SEND};
 use super::super::found::Found;
@@ -42,6 +43,7 @@ pub(crate) struct Decoder {
     container: u64,
     /// The last object was a comment that already reported the loss that a loss object would report.
     loss_told: bool,
+    bit_rates: BitRates,
 }
 
 impl Default for Decoder {
@@ -58,6 +60,7 @@ impl Default for Decoder {
             fault: None,
             container: 0,
             loss_told: false,
+            bit_rates: BitRates::new(),
         }
     }
 }
@@ -116,6 +119,10 @@ impl Decode for Decoder {
         false
     }
 
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
+    }
+
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             self.frames(records);
@@ -137,18 +144,16 @@ impl Decode for Decoder {
         /// A longer object is not begun before a place.
         const MOST_BEGUN_BYTES: usize = 4096;
         let begun = &self.objects[self.at..];
+        let Self { started, start_ns, file_bytes, container, loss_told, bit_rates, .. } = self;
         self.fault.is_none()
             && self.is_between()
             && begun.len() <= MOST_BEGUN_BYTES
-            && seek::save(
-                &(self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, begun),
-                state,
-            )
+            && seek::save(&(started, start_ns, file_bytes, container, loss_told, begun, bit_rates), state)
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
-        (self.started, self.start_ns, self.file_bytes, self.container, self.loss_told, self.objects) =
-            seek::load(state)?;
+        let Self { started, start_ns, file_bytes, container, loss_told, objects, bit_rates, .. } = self;
+        (*started, *start_ns, *file_bytes, *container, *loss_told, *objects, *bit_rates) = seek::load(state)?;
         Some(())
     }
 
@@ -438,6 +443,12 @@ impl Decoder {
             Ok(Content::Event(channel, event)) => {
                 self.loss_told = kind == EVENT_COMMENT && matches!(event, TraceEvent::Lost { .. });
                 Object::Event(TraceRecord { time_ns, device_ns: None, channel, event })
+            }
+            Ok(Content::BitRates(rates)) => {
+                for (channel, bps) in rates {
+                    bit_rates::learn(&mut self.bit_rates, channel, bps);
+                }
+                Object::Other
             }
             Ok(Content::Request) => Object::Request,
             Ok(Content::LeftOut(what)) => Object::LeftOut(what),

@@ -2,12 +2,14 @@
 
 use flate2::{Compress, Compression, FlushCompress, Status};
 
+use super::super::bit_rates;
 use super::super::calendar::{Date, FIRST_DATE_NS, start_of_trace};
 use super::super::codec::Encode;
 use super::super::event_text;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::sja1000;
+use super::super::writer::WriteOptions;
 use super::super::zone::Zone;
 use super::object::KINDS;
 use super::{
@@ -36,6 +38,8 @@ pub(crate) struct Encoder {
     uncompressed_bytes: u64,
     /// The zone of the dates in the header.
     zone: Zone,
+    /// What is known of the channels' bit rates.
+    note: Option<String>,
 }
 
 impl Default for Encoder {
@@ -49,14 +53,15 @@ impl Default for Encoder {
             object_count: 0,
             uncompressed_bytes: FILE_HEADER_BYTES as u64,
             zone: Zone::default(),
+            note: None,
         }
     }
 }
 
 impl Encoder {
-    /// `zone` is the zone of the file's dates.
-    pub(crate) fn new(zone: &Zone) -> Self {
-        Self { zone: zone.clone(), ..Self::default() }
+    pub(crate) fn new(options: &WriteOptions) -> Self {
+        let note = bit_rates::note(&bit_rates::known(&options.channels));
+        Self { zone: options.zone.clone(), note, ..Self::default() }
     }
 }
 
@@ -105,6 +110,9 @@ impl Encoder {
         self.start_ns = start_of_trace(first_ns);
         self.stop_ns = self.start_ns;
         out.extend_from_slice(&self.file_header(FILE_HEADER_BYTES as u64));
+        if let Some(note) = self.note.take() {
+            self.comment(note.into_bytes(), 0);
+        }
     }
 
     /// Appends an object's header and fields.
@@ -127,11 +135,14 @@ impl Encoder {
     }
 
     /// Adds a comment that carries the whole event.
-    fn comment(&mut self, record: &TraceRecord, offset_ns: u64) {
-        let mut text = Vec::new();
-        event_text::push_marked(&mut text, &record.event);
+    fn event_comment(&mut self, record: &TraceRecord, offset_ns: u64) {
         // The channel comes first, because comments belong to no channel.
-        text.splice(..0, format!("CAN {} ", record.channel).into_bytes());
+        let mut text = format!("CAN {} ", record.channel).into_bytes();
+        event_text::push_marked(&mut text, &record.event);
+        self.comment(text, offset_ns);
+    }
+
+    fn comment(&mut self, mut text: Vec<u8>, offset_ns: u64) {
         // Multiples of four need no padding, on which readers disagree.
         text.resize(text.len().next_multiple_of(4), b' ');
         let mut fields = vec![0; 16];
@@ -234,7 +245,7 @@ impl Encode for Encoder {
                 self.object(CAN_ERROR_EXT, offset_ns, &fields);
             }
             event => {
-                self.comment(record, offset_ns);
+                self.event_comment(record, offset_ns);
                 if let TraceEvent::Lost { count, .. } = event {
                     let mut fields = [0; 16];
                     fields[4..12].copy_from_slice(&offset_ns.to_le_bytes());

@@ -3,6 +3,7 @@
 use cantap_can::BusErrorKind;
 use cantap_can::{Frame, Id};
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::event_text;
 use super::super::issue::Fault;
 use super::super::sja1000;
@@ -45,6 +46,8 @@ pub(super) fn u64_at(bytes: &[u8], at: usize) -> u64 {
 pub(super) enum Content {
     /// A channel and what happened there.
     Event(u8, TraceEvent),
+    /// What a comment says of the channels' bit rates.
+    BitRates(BitRates),
     /// Only the request to send a frame.
     Request,
     /// Something that a CAN trace does not hold, by kind.
@@ -118,6 +121,10 @@ pub(super) fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content
             let len = u32_at(fields, 4) as usize;
             let text = fields.get(16..).unwrap_or_default();
             let text = &text[..text.len().min(len)];
+            let mut rates = BitRates::new();
+            if bit_rates::learn_note(&mut rates, text) {
+                return Ok(Content::BitRates(rates));
+            }
             let channel = text.strip_prefix(b"CAN ").and_then(|rest| {
                 let (number, _) = super::super::text::word(rest);
                 u8::try_from(super::super::text::decimal(number)?).ok()

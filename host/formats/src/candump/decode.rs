@@ -4,6 +4,7 @@ use std::io;
 
 use cantap_can::{Frame, Id};
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::codec::{BATCH, Decode};
 use super::super::error_frames::ErrorFrames;
 use super::super::found::Found;
@@ -37,9 +38,14 @@ pub(crate) struct Decoder {
     /// The digits and time of the last second: most lines are in the same second as the one before.
     second: [u8; 10],
     second_ns: i64,
+    bit_rates: BitRates,
 }
 
 impl Decode for Decoder {
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(found) = self.error_frames.next() {
             return Ok(found);
@@ -54,6 +60,7 @@ impl Decode for Decoder {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
             if matches!(text.first(), None | Some(b'#')) && !line.too_long {
+                bit_rates::learn_note(&mut self.bit_rates, text);
                 continue;
             }
             let parsed = if self.untimed == Some(true) { self.untimed(text) } else { self.parse(text) };
@@ -79,11 +86,11 @@ impl Decode for Decoder {
 
     fn save(&self, state: &mut Vec<u8>) -> bool {
         let is_between = self.error_frames.is_over() && self.note.is_none() && !self.end_missing;
-        is_between && seek::save(&(&self.interfaces, &self.lengths, self.untimed), state)
+        is_between && seek::save(&(&self.interfaces, &self.lengths, self.untimed, &self.bit_rates), state)
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
-        (self.interfaces, self.lengths, self.untimed) = seek::load(state)?;
+        (self.interfaces, self.lengths, self.untimed, self.bit_rates) = seek::load(state)?;
         Some(())
     }
 

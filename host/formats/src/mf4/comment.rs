@@ -9,6 +9,9 @@ use super::blocks::Block;
 /// Properties of a measurement by name, such as `author`; of a group of them, `Device Information.serial number`.
 pub(crate) type Properties = BTreeMap<String, String>;
 
+/// The property of our files with the channels' bit rates.
+pub(super) const BIT_RATES: &str = "cantap.bit-rates";
+
 /// More than these are not kept: the comment may come from anyone.
 const MOST_PROPERTIES: usize = 1_000;
 /// A longer name is none: each property inside a group has the group's name in front of its own.

@@ -4,6 +4,7 @@ use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 use std::io;
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::codec::{BATCH, Decode, PLAIN_BATCH};
 use super::super::found::Found;
 use super::super::input::Input;
@@ -12,7 +13,7 @@ use super::super::seek;
 use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
-use super::comment::{Properties, properties};
+use super::comment::{BIT_RATES, Properties, properties};
 use super::joined::{after_blocks, joined};
 use super::layout::Alone;
 use super::order::Item;
@@ -31,6 +32,7 @@ pub(crate) struct Decoder {
     /// To be reported before the records.
     first: VecDeque<Found>,
     properties: Properties,
+    bit_rates: BitRates,
     /// Where to go on, once the file is opened.
     resume: Option<Saved>,
 }
@@ -54,6 +56,10 @@ impl Decode for Decoder {
             open.plain_frames(frames)?;
         }
         Ok(true)
+    }
+
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
     }
 
     fn properties(&self) -> Option<&Properties> {
@@ -114,6 +120,10 @@ impl Decoder {
             Ok(parts) => (parts, None),
             Err((parts, fault)) => (parts, Some(fault)),
         };
+        // It is for programs.
+        if let Some(rates) = self.properties.remove(BIT_RATES) {
+            bit_rates::learn_list(&mut self.bit_rates, &rates);
+        }
         if let Some(fault) = fault {
             self.first.push_back(Found::Issue(Place::Offset(0), own(fault)?));
         }

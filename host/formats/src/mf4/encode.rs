@@ -3,10 +3,13 @@
 
 use cantap_can::BusErrorKind;
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::codec::Encode;
 use super::super::event_text::EventText;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
+use super::super::writer::WriteOptions;
+use super::comment::BIT_RATES;
 use super::part::{OPEN_COUNTERS, OPEN_LENGTH};
 use super::{BIT_ERROR, DEVICE_TIME, ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC, WORDS};
 use cantap_trace::fd::FD_MAX_BYTES;
@@ -122,6 +125,7 @@ pub(crate) struct Encoder {
     /// The number of records of each kind, and its position in the header.
     counts: [u64; KINDS.len()],
     count_places: [usize; KINDS.len()],
+    bit_rates: BitRates,
 }
 
 /// The blocks of a header, each after those that it links to.
@@ -179,6 +183,10 @@ impl Encoder {
     /// The length of a record of this kind.
     const fn bytes(&self, kind: &Kind) -> u32 {
         kind.bytes + if self.has_device_time { DEVICE_TIME_BYTES } else { 0 }
+    }
+
+    pub(crate) fn new(options: &WriteOptions) -> Self {
+        Self { bit_rates: bit_rates::known(&options.channels), ..Self::default() }
     }
 
     fn begin(&mut self, first_ns: i64, has_device_time: bool) {
@@ -245,13 +253,24 @@ impl Encoder {
         let mut date = self.start_ns.to_le_bytes().to_vec();
         date.extend_from_slice(&[0, 0, 0, 0, UTC, 0, 0, 0]);
         let history = blocks.push(*b"##FH", &[0, comment], &date);
+        let about = if self.bit_rates.is_empty() {
+            0
+        } else {
+            let (tree, name) = BIT_RATES.split_once('.').unwrap_or_default();
+            let rates = bit_rates::listed(&self.bit_rates);
+            let text = format!(
+                "<HDcomment><TX></TX><common_properties><tree name=\"{tree}\"><e name=\"{name}\" unit=\"bit/s\" \
+                 type=\"string\">{rates}</e></tree></common_properties></HDcomment>"
+            );
+            blocks.text(*b"##MD", &text)
+        };
         // The data begin after this block, which is the last one except for the data's own header.
         let data_at = blocks.0.len() as u64 + GROUP_BYTES;
         let group = blocks.push(*b"##DG", &[0, next_group, data_at, 0], &[1, 0, 0, 0, 0, 0, 0, 0]);
         blocks.push(*b"##DT", &[], &[]);
         date.resize(32, 0);
         let mut header = Blocks(Vec::new());
-        header.push(*b"##HD", &[group, history, 0, 0, 0, 0], &date);
+        header.push(*b"##HD", &[group, history, 0, 0, 0, about], &date);
         self.head = blocks.0;
         self.head[HEADER_AT as usize..][..HEADER_BYTES].copy_from_slice(&header.0);
         self.head[8..24].copy_from_slice(b"4.10    cantap  ");

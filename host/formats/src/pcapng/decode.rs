@@ -2,6 +2,7 @@
 
 use std::io;
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::codec::Decode;
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
@@ -16,7 +17,6 @@ use super::{
     INTERFACE_DESCRIPTION, LATE, NAME_RESOLUTION, OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER,
     SIMPLE_PACKET, STATISTICS,
 };
-use cantap_can::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord};
 use serde::{Deserialize, Serialize};
 
@@ -35,8 +35,7 @@ pub(crate) struct Decoder {
     /// For captures of the "any" interface: the interfaces that the packets name.
     cooked: Interfaces,
     packets: Packets,
-    /// Channel, from 1, and bit/s.
-    bit_rates: Vec<(u8, u32)>,
+    bit_rates: BitRates,
 }
 
 /// The content of an interface description.
@@ -335,12 +334,8 @@ impl Decoder {
             }
         }
         let channel = self.names.channel(&name);
-        // Other programs write zero, or the speed of what is not a bus.
-        if let Some(bit_rate) =
-            bit_rate.filter(|bit_rate| (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(bit_rate))
-            && self.bit_rates.iter().all(|(known, _)| *known != channel)
-        {
-            self.bit_rates.push((channel, bit_rate));
+        if let Some(bit_rate) = bit_rate {
+            bit_rates::learn(&mut self.bit_rates, channel, bit_rate);
         }
         let link = Link::of(u32::from(link_type), self.big_endian);
         self.interfaces.push(Interface { link, channel, resolution, offset_s });

@@ -2,10 +2,11 @@
 
 use std::time::{Duration, Instant, SystemTime};
 
+use super::super::channel_info::ChannelInfo;
 use super::super::codec::Encode;
 use super::super::left_out::LeftOut;
 use super::super::socketcan_packet::{EXTENDED, FD_PACKET_BYTES, LINK_TYPE, PACKET_BYTES, REMOTE};
-use super::super::writer::{ChannelInfo, WriteOptions};
+use super::super::writer::WriteOptions;
 use super::{
     BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, DEVICE_NS_MAGIC, END, ENHANCED_PACKET, EPB_DEVICE_NS,
     EPB_DROPCOUNT, EPB_FLAGS, IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION,
@@ -116,7 +117,7 @@ impl Encoder {
             // Reserved, and no limit on a packet's length.
             out.extend_from_slice(&[0; 6]);
             option(out, IF_NAME, cantap_trace::Interface(channel).to_string().as_bytes());
-            if let Some(known) = known {
+            if let Some(known) = known.filter(|known| !known.description.is_empty()) {
                 option(out, IF_DESCRIPTION, cut(&known.description).as_bytes());
             }
             if let Some(bitrate_bps) = known.and_then(|known| known.bitrate_bps) {

@@ -5,6 +5,7 @@ use std::io;
 use cantap_can::ErrorState;
 use cantap_can::{Frame, Id};
 
+use super::super::bit_rates::{self, BitRates};
 use super::super::calendar::{Date, NS_PER_DAY};
 use super::super::codec::Decode;
 use super::super::event_text;
@@ -15,7 +16,7 @@ use super::super::seek;
 use super::super::text;
 use super::super::zone::Zone;
 use super::layout::{Layout, MAX_COLUMNS};
-use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
+use super::{BIT_RATE, EPOCH_DAY, TrcVersion, WARNING_ID, bus_row, error_of, event_of};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -36,6 +37,9 @@ pub(crate) struct Decoder {
     told: Option<TraceRecord>,
     /// The zone of the dates.
     zone: Zone,
+    bit_rates: BitRates,
+    /// The lines of the header are rows of the table of buses.
+    in_buses: bool,
 }
 
 /// The kind of row.
@@ -60,6 +64,8 @@ impl Default for Decoder {
             table: None,
             told: None,
             zone: Zone::default(),
+            bit_rates: BitRates::new(),
+            in_buses: false,
         }
     }
 }
@@ -72,16 +78,25 @@ impl Decoder {
 }
 
 impl Decode for Decoder {
+    fn bit_rates(&self) -> &[(u8, u32)] {
+        &self.bit_rates
+    }
+
     fn save(&self, state: &mut Vec<u8>) -> bool {
-        let Self { version, start_ns, has_start, has_layout, has_rows, layout, table, told, zone: _ } = self;
+        let Self { version, start_ns, has_start, has_layout, has_rows, layout, table, told, .. } = self;
+        let bit_rates = &self.bit_rates;
         let version = TrcVersion::ALL.iter().position(|known| known == version);
         told.is_none()
-            && seek::save(&(version, start_ns, has_start, has_layout, has_rows, layout, table), state)
+            && seek::save(
+                &(version, start_ns, has_start, has_layout, has_rows, layout, table, bit_rates),
+                state,
+            )
     }
 
     fn restore(&mut self, state: &[u8]) -> Option<()> {
         let (version, layout): (Option<usize>, Layout);
-        (version, self.start_ns, self.has_start, self.has_layout, self.has_rows, layout, self.table) =
+        let Self { start_ns, has_start, has_layout, has_rows, table, bit_rates, .. } = self;
+        (version, *start_ns, *has_start, *has_layout, *has_rows, layout, *table, *bit_rates) =
             seek::load(state)?;
         self.version = *TrcVersion::ALL.get(version?)?;
         self.layout = Some(layout).filter(Layout::is_of_a_row)?;
@@ -148,6 +163,14 @@ impl Decoder {
     /// A line of the header, without the semicolon.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         let value = |name: &[u8]| line.strip_prefix(name).map(<[u8]>::trim_ascii);
+        let words = line.trim_ascii();
+        if words.starts_with(b"Bus") && words.ends_with(BIT_RATE.as_bytes()) {
+            self.in_buses = true;
+        } else if words.starts_with(b"--") {
+            self.in_buses = false;
+        } else if let Some((channel, bps)) = self.in_buses.then(|| bus_row(words)).flatten() {
+            bit_rates::learn(&mut self.bit_rates, channel, bps);
+        }
         if let Some(version) = value(b"$FILEVERSION=") {
             self.version = match version {
                 b"1.0" => TrcVersion::V1_0,

@@ -1,5 +1,7 @@
 //! Values by their data type (CiA 301, table 44).
 
+use cantap_signals::shortest_of_f32;
+
 use crate::{Bytes, Value};
 
 /// A value of a type; bytes if the type is unknown or does not fit.
@@ -15,7 +17,7 @@ pub fn value(data_type: Option<u16>, bytes: &[u8]) -> Value {
         (Some(0x02 | 0x03 | 0x04 | 0x10 | 0x12..=0x15), 1..=8) => Value::Number(signed()),
         (Some(0x05 | 0x06 | 0x07 | 0x16 | 0x18..=0x1A), 1..=8) => Value::Number(unsigned() as i64),
         (Some(0x1B), 1..=8) => Value::Hex(unsigned(), 16),
-        (Some(0x08), 4) => Value::Real(f32::from_bits(unsigned() as u32).into()),
+        (Some(0x08), 4) => Value::Real(shortest_of_f32(f32::from_bits(unsigned() as u32))),
         (Some(0x11), 8) => Value::Real(f64::from_bits(unsigned())),
         (Some(0x09), _) => {
             Value::Text(String::from_utf8_lossy(bytes).trim_end_matches('\0').to_owned().into())

@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use cantap_signals::shortest_of_f32;
 use jiff::{ToSpan, civil};
 
 use super::database::{Condition, Database, FieldKind, Group, Kind};
@@ -357,7 +358,7 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
     if kind.field_type == Kind::Float {
         let value = f32::from_bits(raw as u32);
         return if value.is_finite() {
-            Field::real(name, value.into(), kind.unit.as_str())
+            Field::real(name, shortest_of_f32(value), kind.unit.as_str())
         } else {
             Field::missing(name)
         };

@@ -32,6 +32,12 @@ impl LoadCollector {
         })
     }
 
+    /// As [`Statistics::learn_bitrate`]: a trace has said a channel's bit rate. Before the first record, the load is drawn then.
+    pub fn learn_bitrate(&mut self, channel: u8, bitrate_bps: u32) {
+        self.statistics.learn_bitrate(channel, bitrate_bps);
+        self.in_per_cent |= self.channels.is_empty() && !self.statistics.channel_bitrates_bps().is_empty();
+    }
+
     /// Takes the next record of the trace.
     pub fn push(&mut self, record: &TraceRecord) {
         let x = self.axis.seconds(record.time_ns);

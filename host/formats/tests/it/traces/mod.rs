@@ -7,7 +7,7 @@ pub mod mixed;
 
 use std::path::{Path, PathBuf};
 
-use cantap_formats::{Format, LeftOut, ReadOptions, WriteOptions, create_writer, open_reader};
+use cantap_formats::{ChannelInfo, Format, LeftOut, ReadOptions, WriteOptions, create_writer, open_reader};
 use cantap_trace::{TraceEvent, TraceRecord};
 
 /// A boat's bus (gpsd's test data): one channel, extended identifiers, microseconds.
@@ -62,9 +62,13 @@ pub fn file_name(format: Format, compression: &str) -> String {
     format!("{format}.{suffix}{compression}")
 }
 
-/// Writes a file and returns what it could not carry.
+/// Writes a file and returns what it could not carry. Bit rates are in it, which other programs must not mind.
 pub fn write(path: &Path, format: Format, records: &[TraceRecord]) -> LeftOut {
-    let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
+    let rate = |(channel, bps)| ChannelInfo { channel, bitrate_bps: Some(bps), description: String::new() };
+    // In pcapng each of them would be an interface, whatever comes.
+    let rates: &[_] = if format == Format::Pcapng { &[] } else { &[(1, 500_000), (2, 83_333)] };
+    let channels = rates.iter().copied().map(rate).collect();
+    let options = WriteOptions { format: Some(format), channels, ..WriteOptions::default() };
     let mut writer = create_writer(path, &options).unwrap();
     for record in records {
         writer.write(record).unwrap();

@@ -12,6 +12,7 @@ from ._native import (
     DeviceError,
     FormatError,
     Frame,
+    Odx,
     PeriodicFrame,
     Record,
     Records,
@@ -22,7 +23,7 @@ from ._native import (
     __version__,
 )
 from .device import Checksum, Counter, Device, RandomByte, boards, open
-from .diagnostics import Ecu, NegativeResponse
+from .diagnostics import Ecu, NegativeResponse, load_odx
 from .traces import Database, Messages, dataset, decode, encode, load_database, read, scan, search, stats, write
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "Frame",
     "Messages",
     "NegativeResponse",
+    "Odx",
     "PeriodicFrame",
     "RandomByte",
     "Record",
@@ -56,6 +58,7 @@ __all__ = [
     "decode",
     "encode",
     "load_database",
+    "load_odx",
     "open",
     "read",
     "scan",

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Any, SupportsIndex, TypedDict, final, overload, type_check_only
+from typing import Any, NotRequired, SupportsIndex, TypedDict, final, overload, type_check_only
 
 import numpy as np
 import pandas as pd
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 
 from ._columns import Column, Row, Schema
 from ._sources import TraceFile
+from .traces import Seconds
 
 __all__ = [
     "CantapError",
@@ -24,6 +25,7 @@ __all__ = [
     "FormatError",
     "Frame",
     "NodeBus",
+    "Odx",
     "PeriodicFrame",
     "Reading",
     "Record",
@@ -34,13 +36,19 @@ __all__ = [
     "Table",
     "__version__",
     "ask_ecu",
+    "bit_rate",
+    "channel_number",
     "decode_table",
+    "disturb",
+    "divide",
     "encode_tables",
+    "identifier",
     "is_trace_name",
     "list_boards",
     "ready_nodes",
     "refusal_text",
     "search",
+    "seconds",
     "stats",
     "table_of_messages",
     "write",
@@ -69,18 +77,19 @@ class Options(TypedDict):
     db: Database | None
     signals: list[str]
     filters: list[str]
-    channels: list[int]
+    channels: list[int | str]
     start: str | None
     end: str | None
     format: str | None
     zone: str | None
     strict: bool
+    indexes: NotRequired[str]
 
 @final
 class Database:
     """Compiled databases: loaded once, used for any number of traces, devices and frames, in any thread."""
 
-    def __new__(cls, files: list[tuple[int | None, str | os.PathLike[str]]], j1939: bool) -> Database: ...
+    def __new__(cls, files: list[tuple[int | str | None, str | os.PathLike[str]]], j1939: bool) -> Database: ...
     @staticmethod
     def of_virtual_car() -> Database:
         """The database of the virtual car (`virtual:car`)."""
@@ -91,11 +100,11 @@ class Database:
     def message_names(self) -> list[str]:
         """The names of all messages."""
     def encode(
-        self, message: str, signals: dict[str, Any] | None = None, *, channel: int | None = None
+        self, message: str, signals: dict[str, Any] | None = None, *, channel: int | str | None = None
     ) -> Frame:
         """The frame of a message with these values: numbers, or texts of the signals' tables. The others have the database's start value,
         or 0."""
-    def decode(self, frame: Any, *, channel: int = ...) -> tuple[str, dict[str, float | str | None]] | None:
+    def decode(self, frame: Any, *, channel: int | str = ...) -> tuple[str, dict[str, float | str | None]] | None:
         """The name of a frame's message, and its values by signal: `Gear` is the number, `Gear.text` the text of its table. `None` if no
         database has it, and for an error frame. `frame` is a `Frame`, a `Record`, a text, or a message of python-can.
         `channel`, by which a database is chosen, is 1 unless it is given."""
@@ -248,11 +257,12 @@ class Scan(Iterator[Table]):
 
 @final
 class Frame:
-    """A CAN frame: classical, or of CAN FD (`fd`, `brs` or `esi`)."""
+    """A CAN frame: classical, or of CAN FD (`fd`, `brs` or `esi`). `id` is a number, or a text such as `"1A1"` or `"000001A1"`, whose digits say
+    how many bits it has; or a whole frame, `"1A1#00"`."""
 
     def __new__(
         cls,
-        id: int,
+        id: int | str,
         data: bytes | bytearray | list[int] | None = None,
         *,
         extended: bool | None = None,
@@ -264,7 +274,7 @@ class Frame:
     ) -> Frame: ...
     @staticmethod
     def parse(text: str) -> Frame:
-        """Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`, `123##11122`."""
+        """Parses a frame as `cantap send` takes it: `123#1122`, `1#00`, `0x18FEF100#11.22`, `00000123#R3`, `123##11122`."""
     @property
     def id(self) -> int:
         """The identifier."""
@@ -360,9 +370,9 @@ class Records(Iterator[Record]):
 
     def __iter__(self) -> Records: ...
     def __next__(self) -> Record: ...
-    def read(self, timeout: float | None = None) -> Record | None:
+    def read(self, timeout: Seconds | None = None) -> Record | None:
         """The next record; `None` if there is none within `timeout` seconds, or after the last."""
-    def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
+    def batch(self, seconds: Seconds | None = None, rows: int = 65_536) -> Table:
         """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
     @property
     def lost(self) -> tuple[int, int]:
@@ -372,7 +382,7 @@ class Records(Iterator[Record]):
     def close(self) -> None:
         """Stops listening; waiting records can still be read."""
     def _messages(
-        self, timeout: float | None
+        self, timeout: Seconds | None
     ) -> list[
         tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool, bool, bool]
     ]: ...
@@ -384,15 +394,15 @@ class NodeBus:
     def __new__(
         cls,
         address: str | None,
-        channel: int,
-        bitrate: int | None,
+        channel: int | str,
+        bitrate: int | str | None,
         options: str,
         database: Database | None,
     ) -> NodeBus: ...
     def add(self, name: str, source: str | None) -> int: ...
     def end(self, node: int) -> None: ...
-    def send(self, channel: int, frame: Frame | str) -> None: ...
-    def repeat(self, handle: int, channel: int, frame: Frame | str | None, period_ns: int) -> None: ...
+    def send(self, channel: int | str, frame: Frame | str) -> None: ...
+    def repeat(self, handle: int, channel: int | str, frame: Frame | str | None, period_ns: int) -> None: ...
     def now_ns(self) -> int: ...
     def advance(self, until_ns: int) -> list[Record]: ...
     def messages(self) -> list[tuple[float, str, str]]: ...
@@ -401,6 +411,23 @@ class NodeBus:
 
 def ready_nodes() -> list[tuple[str, str]]:
     """The ready nodes: the name of each, and what it is."""
+
+@final
+class Odx:
+    """What PDX packages and ODX documents say of ECUs: names of requests, and the values of their answers."""
+
+    def __new__(cls, files: list[str | os.PathLike[str]]) -> Odx: ...
+    @property
+    def warnings(self) -> list[str]:
+        """What is not evaluated, in words."""
+    @property
+    def ecus(self) -> list[tuple[str, list[str]]]:
+        """The ECUs: the name of each, and the pairs of its identifiers."""
+    def requests(self, pair: str) -> dict[str, tuple[bytes, list[str]]]:
+        """The requests of an ECU, `7E0:7E8`, by name: their bytes, and what else whoever asks has to give."""
+    def _only_pair(self) -> str | None: ...
+    def _request(self, pair: str, name: str, begins: bytes) -> bytes: ...
+    def _values(self, pair: str, request: bytes, answer: bytes) -> tuple[dict[str, Any], str | None]: ...
 
 @final
 class PeriodicFrame:
@@ -434,14 +461,14 @@ class Device:
     @property
     def is_virtual_car(self) -> bool: ...
     def info(self) -> dict[str, Any]: ...
-    def open_channel(self, number: int, options: dict[str, Any]) -> tuple[int, str | None]: ...
+    def open_channel(self, number: int | str, options: dict[str, Any]) -> tuple[int, str | None]: ...
     def keep_intervals(self) -> None: ...
-    def autobaud(self, number: int, silence: float) -> int: ...
-    def close_channel(self, number: int) -> None: ...
+    def autobaud(self, number: int | str, silence: Seconds) -> int: ...
+    def close_channel(self, number: int | str) -> None: ...
     def open_channels(self) -> dict[int, dict[str, Any]]: ...
     def records(
         self,
-        channel_number: int | None = None,
+        channel_number: int | str | None = None,
         filters: list[str] = ...,
         only_received: bool = False,
         capacity: int = ...,
@@ -449,29 +476,29 @@ class Device:
     ) -> Records: ...
     def send(
         self,
-        number: int,
+        number: int | str,
         frames: list[Frame | str] | list[Frame],
-        timeout: float | None,
+        timeout: Seconds | None,
         at_ns: int | None = None,
         queue_timeout: float = 1.0,
         node: int = ...,
     ) -> list[int]: ...
-    def send_now(self, number: int, frame: Frame | str, node: int) -> bool: ...
-    def reopen(self, number: int, filters: list[str]) -> None: ...
-    def abort(self, number: int) -> None: ...
+    def send_now(self, number: int | str, frame: Frame | str, node: int) -> bool: ...
+    def reopen(self, number: int | str, filters: list[str]) -> None: ...
+    def abort(self, number: int | str) -> None: ...
     def periodic(
         self,
-        number: int,
+        number: int | str,
         frame: Frame | str,
-        period_s: float,
+        period: Seconds,
         count: int,
         modifiers: list[tuple[str, int, int, int, str]],
         node: int = ...,
     ) -> PeriodicFrame: ...
     def reply(
         self,
-        number: int,
-        to: tuple[int, int | None, bool | None],
+        number: int | str,
+        to: tuple[int | str, int | str | None, bool | None],
         frame: Frame | str,
         count: int,
     ) -> Reply: ...
@@ -482,17 +509,21 @@ class Device:
     def gateway(self) -> dict[str, Any]: ...
     def clock(self) -> dict[str, Any]: ...
     def time_ns(self) -> int: ...
-    def recover(self, number: int) -> None: ...
-    def identify(self, seconds: int) -> None: ...
+    def recover(self, number: int | str) -> None: ...
+    def identify(self, time: Seconds) -> None: ...
     def close(self) -> None: ...
 
+def bit_rate(rate: int | str) -> int: ...
+def channel_number(channel: int | str) -> int: ...
+def identifier(id: int | str) -> tuple[int, bool]: ...
+def seconds(time: Seconds) -> float: ...
 def list_boards() -> list[tuple[str, str | None, str | None]]: ...
 
 def stats(
     options: Options,
-    bitrates: list[tuple[int | None, int]],
-    data_bitrates: list[tuple[int | None, int]],
-    window_s: float,
+    bitrates: list[tuple[int | str | None, int | str]],
+    data_bitrates: list[tuple[int | str | None, int | str]],
+    window: Seconds,
 ) -> dict[str, Any]: ...
 @final
 class Reading:
@@ -509,13 +540,24 @@ def decode_table(
 ) -> tuple[list[tuple[str, Table]], Table]: ...
 def ask_ecu(
     device: Device,
-    number: int,
+    number: int | str,
     pair: str,
     is_to_all: bool,
     data: bytes,
-    times: tuple[float, float, float],
+    times: tuple[Seconds, Seconds, Seconds],
     padding: int | None,
 ) -> list[tuple[str, bytes]]: ...
+def disturb(
+    device: Device,
+    number: int | str,
+    at: Seconds | None,
+    id: int | str | None,
+    nth: int | None,
+    length: int,
+    count: int,
+    every: Seconds,
+) -> list[dict[str, Any]]: ...
+def divide(path: str | os.PathLike[str], options: Options, part_bytes: int) -> list[tuple[int | None, int | None, int]] | None: ...
 def encode_tables(tables: list[tuple[str, Any]], db: Database) -> Table: ...
 def is_trace_name(name: str | os.PathLike[str]) -> bool: ...
 def refusal_text(service: int, code: int) -> tuple[str, str]: ...

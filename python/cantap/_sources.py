@@ -54,7 +54,7 @@ def _files(source: Any, may_be_several: bool) -> Iterator[TraceFile]:
 def _of_path(path: Any) -> Iterator[TraceFile]:
     if not isinstance(path, str):
         yield path
-    elif re.match(r"[a-z][a-z0-9+.-]+://", path):
+    elif is_url(path):
         yield from _of_url(path)
     elif os.path.isdir(path):
         yield from _of_folder(path)
@@ -67,22 +67,64 @@ def _of_path(path: Any) -> Iterator[TraceFile]:
         yield path
 
 
-def _of_url(url: str) -> Iterator[TraceFile]:
+def file_system(url: str) -> tuple[Any, str]:
+    """The file system of fsspec that a URL is in, and the path there."""
     try:
         import fsspec
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"{url} is read by fsspec; install it: pip install 'cantap[fsspec]'", name="fsspec") from error
     system, path = fsspec.url_to_fs(url)
-    if glob.has_magic(path):
-        names = [name for name in system.glob(path) if not system.isdir(name)]
+    # It remembers listings for as long as the program runs: what has come since would be left out.
+    system.invalidate_cache()
+    return system, path
+
+
+def _of_url(url: str) -> Iterator[TraceFile]:
+    system, path = file_system(url)
+    # A name may have brackets itself.
+    if glob.has_magic(path) and not system.exists(path):
+        names = _files_among(system, system.glob(path, detail=True).values())
     elif system.isdir(path):
-        names = _traces(url, [name for name in system.ls(path, detail=False) if not system.isdir(name)])
+        names = [*own_file(system, path), *_traces(url, _files_among(system, system.ls(path, detail=True)))]
     else:
         names = [path]
     if not names:
         raise FileNotFoundError(f"no file is called like {url}")
     for name in sorted(names, key=in_order):
-        yield system.unstrip_protocol(name), _Opener(system, name)
+        yield opener(system, name)
+
+
+def _files_among(system: Any, entries: Iterable[Any]) -> list[str]:
+    """The names of the files in a listing. In an object store a name may be a file's and a folder's: `a.blf` beside `a.blf/b.blf`."""
+    found: dict[str, bool] = {}
+    for entry in entries:
+        found[entry["name"]] = found.get(entry["name"], False) or entry["type"] == "file"
+    # Of such a name a pattern's listing may have the folder alone.
+    return [name for name, is_file in found.items() if is_file or is_trace_name(name) and _has_content(system, name)]
+
+
+def own_file(system: Any, path: str) -> list[str]:
+    """A folder's name, if it is a file's, too."""
+    return [path] if is_trace_name(path) and _has_content(system, path) else []
+
+
+def _has_content(system: Any, name: str) -> bool:
+    try:
+        with system.open(name, "rb") as file:
+            file.read(1)
+    except OSError:
+        return False
+    return True
+
+
+def opener(system: Any, name: str) -> tuple[str, Callable[[], Any]]:
+    """A file of a file system of fsspec: what it is called, and what opens it."""
+    return system.unstrip_protocol(name), _Opener(system, name)
+
+
+def is_url(path: Any) -> bool:
+    """Whether fsspec is to open it."""
+    return isinstance(path, str) and re.match(r"[a-z][a-z0-9+.-]+://", path) is not None
 
 
 class _Opener:
@@ -124,4 +166,4 @@ def _traces(folder: str, names: list[str]) -> list[str]:
 
 def in_order(name: str) -> list[tuple[int, int, str]]:
     """So that `2.mf4` is before `10.mf4`."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name)]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name)]

@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import collections
 import pathlib
-import re
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ._native import CantapError, Database, Frame, NodeBus, Record, ready_nodes
+from ._native import CantapError, Database, Frame, NodeBus, Record, channel_number, identifier, ready_nodes, seconds
+
+if TYPE_CHECKING:
+    from .device import Channel, Rate
+    from .traces import Seconds
 
 TRACE = 40
 """How many of the last frames are shown with a failure."""
-
-_UNITS = {"": 1.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-
-
-def _seconds(time: float | str) -> float:
-    """Seconds, from a number or a text such as `20ms`."""
-    if isinstance(time, str):
-        found = re.fullmatch(r"\s*([0-9.]+)\s*(s|ms|us|ns|)\s*", time)
-        if not found:
-            raise ValueError(f"{time!r} is not a time; write it in seconds, or as in '20ms'")
-        return float(found[1]) * _UNITS[found[2]]
-    return float(time)
 
 
 class Received:
@@ -96,13 +87,13 @@ class Bus:
         self,
         address: str | None = None,
         *,
-        channel: int = 1,
-        bitrate: int | None = None,
+        channel: Channel = 1,
+        bitrate: Rate | None = None,
         db: Database | None = None,
         options: str = "load=0",
     ) -> None:
         self._native = NodeBus(address, channel, bitrate, options, db)
-        self._channel, self._db = channel, db
+        self._channel, self._db = channel_number(channel), db
         self._begin_ns = self._native.now_ns()
         self._ahead: collections.deque[Record] = collections.deque()
         self._last: collections.deque[str] = collections.deque(maxlen=TRACE)
@@ -129,7 +120,7 @@ class Bus:
 
     # Sending
 
-    def send(self, what: Frame | str, signals: dict[str, Any] | None = None, *, channel: int | None = None) -> None:
+    def send(self, what: Frame | str, signals: dict[str, Any] | None = None, *, channel: Channel | None = None) -> None:
         """Sends a frame, such as `"123#0102"`, or a message of the database with these signals."""
         frame = self._frame(what, signals)
         self._look()
@@ -138,17 +129,17 @@ class Bus:
     def periodic(
         self,
         what: Frame | str,
-        period: float | str,
+        period: Seconds,
         signals: dict[str, Any] | None = None,
         *,
-        channel: int | None = None,
+        channel: Channel | None = None,
     ) -> Repeated:
         """Sends a frame now and then again after each period."""
-        period_ns = round(_seconds(period) * 1e9)
+        period_ns = round(seconds(period) * 1e9)
         if period_ns <= 0:
             raise ValueError(f"{period!r} is not a period; it is longer than nothing")
         self._handles += 1
-        repeated = Repeated(self, self._handles, self._channel if channel is None else channel, period_ns)
+        repeated = Repeated(self, self._handles, self._channel if channel is None else channel_number(channel), period_ns)
         repeated.update(what, signals)
         return repeated
 
@@ -159,17 +150,17 @@ class Bus:
         """Seconds since the bus was opened, by its clock: simulated time, or the device's."""
         return (self._native.now_ns() - self._begin_ns) / 1e9
 
-    def wait(self, time: float | str) -> None:
+    def wait(self, time: Seconds) -> None:
         """Lets time pass."""
         self._find(lambda _: False, time)
 
     def expect(
         self,
         what: int | str,
-        within: float | str,
+        within: Seconds,
         where: Callable[[Received], bool] | None = None,
         *,
-        channel: int | None = None,
+        channel: Channel | None = None,
     ) -> Received:
         """The next such frame of another node; an `AssertionError` if there is none within this time of the bus's clock.
 
@@ -183,7 +174,7 @@ class Bus:
             raise AssertionError(f"no frame {name}{kind} within {within if isinstance(within, str) else f'{within} s'}")
         return found
 
-    def expect_none(self, what: int | str, within: float | str, *, channel: int | None = None) -> None:
+    def expect_none(self, what: int | str, within: Seconds, *, channel: Channel | None = None) -> None:
         """Lets time pass; an `AssertionError` if there is such a frame."""
         found = self._find(self._matcher(what, None, channel), within)
         if found is not None:
@@ -224,20 +215,22 @@ class Bus:
         return self._db.encode(what, signals or {})
 
     def _matcher(
-        self, what: int | str, where: Callable[[Received], bool] | None, channel: int | None
+        self, what: int | str, where: Callable[[Received], bool] | None, channel: Channel | None
     ) -> Callable[[Received], bool]:
         wanted: Callable[[Received], bool]
         if isinstance(what, int):
             wanted = lambda received: received.id == what
         elif self._db is not None and what in self._db.message_names:
             wanted = lambda received: self._name(received.record) == what
-        elif re.fullmatch(r"[0-9A-Fa-f]{1,3}|[0-9A-Fa-f]{8}", what):
-            pair = (int(what, 16), len(what) == 8)
-            wanted = lambda received: (received.id, received.record.extended) == pair
         else:
-            raise ValueError(f"{what!r} is neither an identifier, such as '7E8', nor a message of the database")
+            try:
+                pair = identifier(what)
+            except ValueError as error:
+                raise ValueError(f"{what!r} is neither an identifier, such as '7E8', nor a message of the database: {error}") from None
+            wanted = lambda received: (received.id, received.record.extended) == pair
+        number = None if channel is None else channel_number(channel)
         return lambda received: (
-            (channel is None or received.record.channel == channel)
+            (number is None or received.record.channel == number)
             and wanted(received)
             and (where is None or bool(where(received)))
         )
@@ -266,8 +259,8 @@ class Bus:
     def _collect(self) -> None:
         self.log += self._native.messages()
 
-    def _find(self, wanted: Callable[[Received], bool], within: float | str) -> Received | None:
-        until_ns = self._native.now_ns() + round(_seconds(within) * 1e9)
+    def _find(self, wanted: Callable[[Received], bool], within: Seconds) -> Received | None:
+        until_ns = self._native.now_ns() + round(seconds(within) * 1e9)
         is_over = False
         try:
             while True:

@@ -122,11 +122,18 @@ def _flag(argument: str, value: Any) -> bool:
     return found
 
 
+def _bit_rate(rate: Any) -> int:
+    try:
+        return _native.bit_rate(rate)
+    except ValueError as error:
+        raise can.CanInitializationError(f"bitrate: {error}") from None
+
+
 class CantapBus(can.BusABC):
     """A channel of a cantap analyser. Two channels of one analyser are two Bus objects that share its session.
 
     :param channel: the device's address and the channel's number: `/dev/ttyACM0:1`, `virtual:2`, `tcp://bench:1`.
-    :param bitrate: in bit/s; without it, the one saved on the device. `timing` may be given instead.
+    :param bitrate: in bit/s, or as `500k`, or `auto`, which finds it by listening; without it, the one saved on the device. `timing` may be given instead.
     :param receive_own_messages: also receive messages that this device sends on this channel.
     :param listen_only: send nothing and acknowledge nothing. Also with `state=can.BusState.PASSIVE`.
     :param one_shot: send each frame once.
@@ -141,7 +148,7 @@ class CantapBus(can.BusABC):
         channel: str,
         can_filters: Any = None,
         *,
-        bitrate: int | None = None,
+        bitrate: int | str | None = None,
         timing: can.BitTiming | can.BitTimingFd | None = None,
         receive_own_messages: bool = False,
         listen_only: bool = False,
@@ -163,8 +170,7 @@ class CantapBus(can.BusABC):
         self._address, self._number = _split(str(channel))
         self._own = _flag("receive_own_messages", receive_own_messages)
         self._options: dict[str, Any] = {
-            # From a configuration file it is a text.
-            "bitrate": int(bitrate) if bitrate is not None else None,
+            "bitrate": bitrate if bitrate in (None, "auto") else _bit_rate(bitrate),
             "sample_point": None,
             "sjw": None,
             "segments": None,
@@ -198,6 +204,8 @@ class CantapBus(can.BusABC):
                 users[self._me] = can_filters or None
                 try:
                     if is_first:
+                        if self._options["bitrate"] == "auto":
+                            self._options["bitrate"] = self._device.autobaud(self._number)
                         session.open(self._number, mode, self._options)
                     else:
                         self._join(mode)
@@ -243,7 +251,7 @@ class CantapBus(can.BusABC):
         """Another Bus object has the channel open: its settings stay as they are."""
         now = self._device.channels[self._number]
         wanted = self._options["bitrate"]
-        if wanted not in (None, now["bitrate"]) or now["mode"] != mode:
+        if wanted not in (None, "auto", now["bitrate"]) or now["mode"] != mode:
             raise can.CanInitializationError(
                 f"{self.channel_info} is open at {now['bitrate']} bit/s, {now['mode']}; open it as it is"
             )

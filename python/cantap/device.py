@@ -13,12 +13,20 @@ from typing import Any, Literal, SupportsIndex, TypeAlias
 
 from . import _native
 from ._arguments import channels as _channels
+from ._arguments import rates as _rates
 from ._arguments import words as _words
-from ._native import Frame, PeriodicFrame, Record, Records, Reply, Table
-from .diagnostics import Ecu
+from ._native import Frame, Odx, PeriodicFrame, Record, Records, Reply, Table
+from .diagnostics import Ecu, load_odx
+from .traces import Path, Rates, Seconds
 
 Mode: TypeAlias = Literal["listen-only", "normal", "loopback", "silent-loopback"]
 AnyFrame: TypeAlias = "Frame | str"
+Channel: TypeAlias = "int | str"
+"""1, 2, or as an interface: `can0` is channel 1."""
+Rate: TypeAlias = "int | str"
+"""In bit/s, or `500k`; `auto` finds it by listening."""
+Id: TypeAlias = "int | str"
+"""`0x123`, or `"123"`: eight digits have 29 bits."""
 ChecksumName: TypeAlias = Literal["xor", "sum", "crc8-j1850"]
 
 CAPACITY = 1 << 20
@@ -79,8 +87,8 @@ class Device:
 
     def open_channel(
         self,
-        channel: int,
-        bitrate: int | Literal["auto"] | None = None,
+        channel: Channel,
+        bitrate: Rate | None = None,
         *,
         mode: Mode = "listen-only",
         sample_point: float | None = None,
@@ -93,7 +101,7 @@ class Device:
         """Opens a channel, 1 or 2, and returns its bit rate in bit/s.
 
         Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s. `"auto"` finds it by
-        listening, see `autobaud`.
+        listening, see `autobaud`. A rate is in bit/s, or written as `500k`.
         `sample_point` is in per cent; `segments` is prescaler, segment 1, segment 2 and jump width, instead of a bit rate.
         `filter` as with `cantap.read`: the device drops other frames in hardware as far as it can, and this computer drops the rest.
         """
@@ -114,7 +122,7 @@ class Device:
         )
         return rate
 
-    def autobaud(self, channel: int, *, timeout: float = 10.0) -> int:
+    def autobaud(self, channel: Channel, *, timeout: Seconds = 10.0) -> int:
         """Finds the bit rate of a channel's bus, in bit/s, without sending anything: one frame is enough. The channel must be closed.
 
         The rate found before on this channel is tried first. Raises `DeviceError`, with what to check, if there is no traffic for
@@ -124,30 +132,43 @@ class Device:
 
     def ecu(
         self,
-        channel: int,
-        request: int = 0x7E0,
-        response: int | None = None,
+        channel: Channel,
+        request: Id | None = None,
+        response: Id | None = None,
         *,
+        odx: Odx | Path | Iterable[Path] | None = None,
         to_all: bool = False,
-        p2: float = 1.0,
-        p2_star: float = 5.0,
-        timeout: float = 30.0,
+        p2: Seconds = 1.0,
+        p2_star: Seconds = 5.0,
+        timeout: Seconds = 30.0,
         padding: int | None = 0,
     ) -> Ecu:
         """An ECU to ask, over UDS, KWP2000 or OBD-II. The channel must be open with `mode="normal"`.
 
-        `request`, `response`: the identifiers. The response's is 8 more, or of 29 bits (18DAxxyy) the same with both addresses exchanged,
-        unless it is given. `to_all`: requests go to all ECUs at once. `p2`: seconds until an answer begins; `p2_star`: the same after the
+        `request`, `response`: the identifiers, 7E0 and 7E8 if none is given; or both in one, as `"7E0:7E8"`, or `"6F1/12:612/F1"` where the first data byte is an address. The response's is 8 more, or of 29 bits (18DAxxyy) the same with both addresses exchanged,
+        unless it is given. `odx`: its description, a PDX package or ODX document (`"car.pdx"`, `"car.pdx:Engine_V2"` for one layer of it): then what it
+        has can be asked by name, and its only ECU's identifiers need not be given. `to_all`: requests go to all ECUs at once. `p2`: seconds until an answer begins; `p2_star`: the same after the
         ECU has said that it is pending; `timeout`: for everything. `padding`: the byte that fills frames up; `None` keeps them short.
         """
-        if response is None:
-            is_normal_fixed = request >> 16 == 0x18DA
-            swapped = request & ~0xFFFF | (request & 0xFF) << 8 | request >> 8 & 0xFF
-            response = swapped if is_normal_fixed else request + 8
-        pair = ":".join(_id_text(id) for id in (request, response))
-        return Ecu(self._native, channel, pair, to_all, (p2, p2_star, timeout), padding)
+        described = None if odx is None else load_odx(odx)
+        if request is None:
+            request = (described and response is None and described._only_pair()) or 0x7E0
+        if isinstance(request, str) and ":" in request:
+            if response is not None:
+                raise ValueError(f"'{request}' is a pair already; leave response out")
+            pair = request
+        else:
+            raw, extended = _native.identifier(request)
+            if response is None:
+                swapped = raw & ~0xFFFF | (raw & 0xFF) << 8 | raw >> 8 & 0xFF
+                response = _id_text(swapped if extended and raw >> 16 == 0x18DA else raw + 8, extended)
+            pair = ":".join(_id_text(*_native.identifier(id)) for id in (request, response))
+        if described is not None:
+            # Whether it has this ECU.
+            described.requests(pair)
+        return Ecu(self._native, channel, pair, to_all, (p2, p2_star, timeout), padding, described)
 
-    def close_channel(self, channel: int) -> None:
+    def close_channel(self, channel: Channel) -> None:
         """Closes a channel, after everything it captured has arrived."""
         self._native.close_channel(channel)
 
@@ -156,7 +177,7 @@ class Device:
         """The open channels, each with `bitrate` and `mode`."""
         return self._native.open_channels()
 
-    def recover(self, channel: int) -> None:
+    def recover(self, channel: Channel) -> None:
         """Brings a channel that was opened with `manual_recovery` back from bus-off."""
         self._native.recover(channel)
 
@@ -166,15 +187,15 @@ class Device:
         """Records as they arrive: frames, errors, states, losses. Ends when the device is closed."""
         return self._records
 
-    def read(self, timeout: float | None = None) -> Record | None:
+    def read(self, timeout: Seconds | None = None) -> Record | None:
         """The next record; `None` if there is none within `timeout` seconds, or after the last."""
         return self._records.read(timeout)
 
-    def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
+    def batch(self, seconds: Seconds | None = None, rows: int = 65_536) -> Table:
         """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
         return self._records.batch(seconds, rows)
 
-    def batches(self, seconds: float = 0.1, rows: int = 65_536) -> Iterator[Table]:
+    def batches(self, seconds: Seconds = 0.1, rows: int = 65_536) -> Iterator[Table]:
         """Tables of what arrived in the last `seconds` or so, one after the other, until the device is closed. None is empty."""
         while not self.closed:
             table = self._records.batch(seconds, rows)
@@ -183,7 +204,7 @@ class Device:
 
     def records(
         self,
-        channel: int | None = None,
+        channel: Channel | None = None,
         *,
         filter: str | Iterable[str] = (),
         only_received: bool = False,
@@ -200,10 +221,10 @@ class Device:
 
     def send(
         self,
-        channel: int,
+        channel: Channel,
         frames: AnyFrame | Iterable[AnyFrame],
         *,
-        timeout: float | None = 1.0,
+        timeout: Seconds | None = 1.0,
         at: float | datetime.datetime | None = None,
     ) -> list[float]:
         """Sends a frame or several, in order, and returns when each was on the bus, in seconds since 1970.
@@ -219,20 +240,20 @@ class Device:
         at_ns = None if at is None else _ns(at)
         return [time_ns / 1e9 for time_ns in self._native.send(channel, all_frames, timeout, at_ns)]
 
-    def abort(self, channel: int) -> None:
+    def abort(self, channel: Channel) -> None:
         """Withdraws what a channel still has to send."""
         self._native.abort(channel)
 
     def send_periodic(
         self,
-        channel: int,
+        channel: Channel,
         frame: AnyFrame,
-        period: float,
+        period: Seconds,
         *,
         count: int = 0,
         modifiers: Iterable[Counter | Checksum | RandomByte] = (),
     ) -> PeriodicFrame:
-        """Has the device send a frame every `period` seconds by its own timer, `count` times or until it is stopped.
+        """Has the device send a frame every `period` (seconds, or `"10ms"`) by its own timer, `count` times or until it is stopped.
 
         `modifiers` change its data before each transmission, in this order: `[Counter(0, bits=4), Checksum(7)]`.
         """
@@ -248,16 +269,43 @@ class Device:
 
     def reply(
         self,
-        channel: int,
-        id: int,
+        channel: Channel,
+        id: Id,
         frame: AnyFrame,
         *,
-        mask: int | None = None,
+        mask: Id | None = None,
         extended: bool | None = None,
         count: int = 0,
     ) -> Reply:
         """Has the device send a frame whenever it receives one with this identifier, within microseconds, until it is stopped."""
         return self._native.reply(channel, (id, mask, extended), frame, count)
+
+    # Error frames
+
+    def disturb(
+        self,
+        channel: Channel,
+        at: Seconds | None = None,
+        *,
+        id: Id | None = None,
+        nth: int | None = None,
+        length: int = 6,
+        count: int = 1,
+        every: Seconds = 0.1,
+        yes_on_a_test_bench: bool = False,
+    ) -> list[dict[str, Any]]:
+        """Makes error frames on purpose (docs/disturb.md), as `cantap disturb` does: `at` a time from now on, by the device's clock, or onto the frames
+        of a periodic identifier. Waits until it is done.
+
+        Only a board whose firmware was built for it can do this, on a channel that is open with `mode="normal"`, and only with
+        `yes_on_a_test_bench=True`: it raises the error counters of every node on the bus. `nth`: onto which frame first, counted from now.
+        `length`: 1 to 12 bits; six are an error frame anywhere. `count`, `every`: how often, at least 20 ms from one to the next.
+
+        Returns what became of each, as `cantap disturb --json` prints it: `length_us` is 0 if it came to nothing.
+        """
+        if yes_on_a_test_bench is not True:
+            raise ValueError("this destroys frames of whatever is on the bus; confirm with yes_on_a_test_bench=True that nothing depends on it")
+        return _native.disturb(self._native, channel, at, id, nth, length, count, every)
 
     # Gateway
 
@@ -305,7 +353,7 @@ class Device:
         """The device's time, in seconds since 1970."""
         return self._native.time_ns() / 1e9
 
-    def identify(self, seconds: int = 5) -> None:
+    def identify(self, seconds: Seconds = 5) -> None:
         """Shows an LED pattern, to find the board among others."""
         self._native.identify(seconds)
 
@@ -329,11 +377,9 @@ class Device:
         raise TypeError("a device cannot be pickled; open it where it is used")
 
 
-def _id_text(id: int) -> str:
+def _id_text(id: int, extended: bool) -> str:
     """As the command reads it: eight digits have 29 bits."""
-    if not 0 <= id <= 0x1FFFFFFF:
-        raise ValueError(f"{id:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one")
-    return f"{id:03X}" if id <= 0x7FF else f"{id:08X}"
+    return f"{id:08X}" if extended else f"{id:03X}"
 
 
 def _ns(at: float | datetime.datetime) -> int:
@@ -364,9 +410,9 @@ def _close_all() -> None:
 
 def open(
     address: str,
-    bitrate: int | Literal["auto"] | None = None,
+    bitrate: Rates | None = None,
     *,
-    channels: SupportsIndex | Iterable[SupportsIndex] | None = None,
+    channels: str | SupportsIndex | Iterable[str | SupportsIndex] | None = None,
     mode: Mode = "listen-only",
     filter: str | Iterable[str] = (),
     capacity: int = CAPACITY,
@@ -379,7 +425,8 @@ def open(
     With `device_intervals`, intervals between times are those that the device's crystal measures; otherwise times follow UTC, and corrections change the
     intervals around them, by up to 100 ppm.
 
-    With a bit rate, or `"auto"`, the `channels` are opened, or all that the device has. Without one, none is: use `Device.open_channel` for each.
+    With a bit rate (`500_000`, `"500k"`), or `"auto"`, the `channels` are opened, or all that the device has. With rates for single channels only,
+    `{2: "250k"}` or `"2:250k"`, it is these. Without any, no channel is opened: use `Device.open_channel` for each.
 
         with cantap.open("/dev/ttyACM0", 500_000) as device:
             for record in device:
@@ -391,9 +438,18 @@ def open(
     if bitrate is not None:
         try:
             filters = _words(filter, "filter")
-            every = range(1, device.info["channels"] + 1)
-            for channel in every if channels is None else _channels(channels):
-                device.open_channel(channel, bitrate, mode=mode, filter=filters)
+            rates = {
+                channel if channel is None else _native.channel_number(channel): rate for channel, rate in _rates(bitrate, "bitrate")
+            }
+            every = list(range(1, device.info["channels"] + 1))
+            if channels is not None:
+                wanted = _channels(channels, every)
+            else:
+                # Rates of single channels say which are meant.
+                wanted = every if None in rates else sorted(rates)
+            for channel in wanted:
+                number = _native.channel_number(channel)
+                device.open_channel(number, rates.get(number, rates.get(None)), mode=mode, filter=filters)
         except BaseException:
             device.close()
             raise

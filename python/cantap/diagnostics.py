@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import re
+import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ._native import DeviceError, ask_ecu, refusal_text
+from ._native import CantapWarning, DeviceError, Odx, ask_ecu, refusal_text
 
 if TYPE_CHECKING:
     from . import _native
+    from .traces import Path, Seconds
 
 Bytes = bytes | bytearray | str | Iterable[int]
 
@@ -34,6 +38,19 @@ class NegativeResponse(DeviceError):
         return (NegativeResponse, (self.service, self.code))
 
 
+def load_odx(files: Odx | Path | Iterable[Path]) -> Odx:
+    """Reads descriptions of ECUs: PDX packages and ODX documents, each with a layer behind it (`car.pdx:Engine_V2`) if one is meant.
+
+    What of a usable file is not evaluated is in `Odx.warnings`, and causes a `CantapWarning`.
+    """
+    if isinstance(files, Odx):
+        return files
+    odx = Odx([files] if isinstance(files, (str, os.PathLike)) else list(files))
+    for text in odx.warnings:
+        warnings.warn(text, CantapWarning, stacklevel=2)
+    return odx
+
+
 class Ecu:
     """An ECU on a channel that was opened with `mode="normal"`; made by `Device.ecu`.
 
@@ -43,11 +60,12 @@ class Ecu:
     def __init__(
         self,
         device: _native.Device,
-        channel: int,
+        channel: int | str,
         pair: str,
         is_to_all: bool,
-        times: tuple[float, float, float],
+        times: tuple[Seconds, Seconds, Seconds],
         padding: int | None,
+        odx: Odx | None = None,
     ) -> None:
         self._device = device
         self._channel = channel
@@ -55,6 +73,7 @@ class Ecu:
         self._is_to_all = is_to_all
         self._times = times
         self._padding = padding
+        self._odx = odx
 
     def request(self, data: Bytes) -> bytes:
         """Sends a request, such as `"22 F190"` or `b"\\x3e\\x00"`, and returns the answer, its first byte included.
@@ -73,11 +92,31 @@ class Ecu:
         """Asks all ECUs at once (7DF), and returns their answers by their identifiers; refusals, which begin with 7F, too."""
         return dict(self._ask(data, True))
 
-    def read_data(self, identifier: int) -> bytes:
-        """The value of a data identifier (UDS service 22), such as F190, the VIN."""
+    def read_data(self, identifier: int | str) -> bytes:
+        """The value of a data identifier (UDS service 22), such as `0xF190` or `"F190"`, the VIN, or by its name in the ECU's description (ODX)."""
+        if isinstance(identifier, str):
+            if not re.fullmatch("(0[xX])?[0-9A-Fa-f]{1,4}", identifier):
+                return self._after(self._named(identifier, bytes([READ_DATA])))
+            identifier = int(identifier, 16)
         if not 0 <= identifier <= 0xFFFF:
             raise ValueError(f"{identifier:#x} is not a data identifier; they go from 0 to 0xFFFF")
         return self._after(bytes([READ_DATA]) + identifier.to_bytes(2, "big"))
+
+    def ask(self, name: str) -> dict[str, Any]:
+        """Sends a request by its name in the ECU's description (ODX), of data (22), a routine (31) or any other, and returns the values of the answer by
+        their names: numbers, texts, bytes. What of the answer has no value causes a `CantapWarning`."""
+        request = self._named(name, b"")
+        answer = self.request(request)
+        assert self._odx is not None
+        values, missing = self._odx._values(self._pair, request, answer)
+        if missing is not None:
+            warnings.warn(f"{name}: {missing} has no value: {answer.hex(' ').upper()}", CantapWarning, stacklevel=2)
+        return values
+
+    def _named(self, name: str, begins: bytes) -> bytes:
+        if self._odx is None:
+            raise ValueError(f"'{name}' is a name of the ECU's description; give it with odx= to Device.ecu, or give a number, such as 0xF190")
+        return self._odx._request(self._pair, name, begins)
 
     def session(self, kind: int) -> None:
         """Opens a diagnostic session (UDS service 10): 1 is the default one, 3 the extended one. It ends on its own after 5 s without

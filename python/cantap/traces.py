@@ -5,14 +5,13 @@ from __future__ import annotations
 import datetime
 import itertools
 import numbers
-import operator
 import os
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import IO, TYPE_CHECKING, Any, SupportsIndex, TypeAlias
 
 from . import _native
-from ._arguments import channels, identifiers, words
+from ._arguments import channels, identifiers, rates, words
 from ._sources import files, is_file
 from ._native import CantapWarning, Database, Report, Scan, Table
 
@@ -28,10 +27,13 @@ Path: TypeAlias = "str | os.PathLike[str]"
 Source: TypeAlias = "Path | IO[bytes] | Iterable[Path | IO[bytes]]"
 """Files of one trace: a path, a pattern such as `drives/*.mf4`, a folder, a URL of fsspec such as `s3://bucket/a.blf`, an open file, or
 several of these."""
-Channels: TypeAlias = "SupportsIndex | Iterable[SupportsIndex]"
-Rates: TypeAlias = "SupportsIndex | Mapping[Any, SupportsIndex]"
+Channels: TypeAlias = "str | SupportsIndex | Iterable[str | SupportsIndex]"
+Rates: TypeAlias = "str | SupportsIndex | Sequence[str] | Mapping[Any, str | SupportsIndex]"
+"""In bit/s, or `500k`: for all channels, or for each of its own, `2:250k` or in a mapping."""
 Databases: TypeAlias = "Path | Database | Iterable[Path] | Mapping[Any, Path]"
 Time: TypeAlias = "float | str | datetime.timedelta | datetime.date | np.datetime64 | np.timedelta64 | np.floating[Any] | np.integer[Any]"
+Seconds: TypeAlias = "float | str | datetime.timedelta | np.timedelta64"
+"""Seconds, `400ms`, or a `timedelta`."""
 Words: TypeAlias = "str | Iterable[str]"
 Identifiers: TypeAlias = "str | SupportsIndex | Iterable[str | SupportsIndex]"
 
@@ -54,7 +56,7 @@ def load_database(
     return database
 
 
-def _pairs(files: Any) -> list[tuple[int | None, Path]]:
+def _pairs(files: Any) -> list[tuple[int | str | None, Path]]:
     if isinstance(files, (str, os.PathLike)):
         return [(None, files)]
     if isinstance(files, Mapping):
@@ -238,7 +240,7 @@ def stats(
     bitrate: Rates | None = None,
     *,
     data_bitrate: Rates | None = None,
-    window: float = 1.0,
+    window: Seconds = 1.0,
     filter: Words = (),
     channel: Channels = (),
     start: Time | None = None,
@@ -249,21 +251,11 @@ def stats(
 ) -> dict[str, Any]:
     """Statistics of a trace, as from `cantap stats --json`: load, rates, periods and jitter by identifier, losses, errors.
 
-    `bitrate`: in bit/s, for all channels or by channel; without it there is no load. `data_bitrate`: for CAN FD's data phases.
-    `window`: length in seconds of the windows searched for peaks.
+    `bitrate`: in bit/s or as `500k`, for all channels or by channel (`{2: "250k"}`, `"2:250k"`); without it there is no load. `data_bitrate`: for CAN FD's data phases.
+    `window`: length of the windows searched for peaks, in seconds or as `100ms`.
     """
     options = _options(path, None, (), filter, channel, start, end, format, zone, strict)
-    return _native.stats(options, _rates(bitrate), _rates(data_bitrate), window)
-
-
-def _rates(rates: Rates | None) -> list[tuple[int | None, int]]:
-    if rates is None:
-        return []
-    if isinstance(rates, SupportsIndex):
-        return [(None, operator.index(rates))]
-    if isinstance(rates, Mapping):
-        return [(channel, operator.index(rate)) for channel, rate in rates.items()]
-    raise TypeError(f"a bit rate is a number, or one for each channel in a mapping, not {type(rates).__name__}")
+    return _native.stats(options, rates(bitrate, "bitrate"), rates(data_bitrate, "data_bitrate"), window)
 
 
 def write(

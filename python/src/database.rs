@@ -12,7 +12,7 @@ use pyo3::types::PyDict;
 use crate::channels::Named;
 use crate::error::Error;
 use crate::frame::Frame;
-use crate::number::OfTrace;
+use crate::grammar::OfTrace;
 use crate::selection::{only, selection};
 use crate::table::Table;
 

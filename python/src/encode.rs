@@ -23,8 +23,8 @@ use pyo3::types::{PyDict, PyList, PyString};
 use crate::database::Database;
 use crate::error::Error;
 use crate::frame::{AnyFrame, Frame, Record};
+use crate::grammar::OfTrace;
 use crate::messages::table_of;
-use crate::number::OfTrace;
 use crate::scan::warning;
 use crate::table::{Table, batches_of};
 

@@ -1,6 +1,7 @@
 //! Frames and records, for Python.
 
 use cantap_columns::FrameColumns;
+use cantap_trace::grammar::any_frame;
 use cantap_trace::{
     BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame,
     TraceRecord, TransmitFailure,
@@ -10,6 +11,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
 use crate::error::Error;
+use crate::grammar::Identifier;
 use crate::number::Whole;
 use crate::table::Table;
 
@@ -34,7 +36,7 @@ impl Frame {
     #[expect(clippy::too_many_arguments, clippy::fn_params_excessive_bools, reason = "each by its name")]
     #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None, fd=false, brs=false, esi=false))]
     fn new(
-        id: Whole<u32>,
+        id: &Bound<'_, PyAny>,
         data: Option<Bytes>,
         extended: Option<bool>,
         remote: bool,
@@ -43,10 +45,21 @@ impl Frame {
         brs: bool,
         esi: bool,
     ) -> PyResult<Self> {
-        let id = identifier(id.0, extended)?;
+        let wrong = |words: &str| Err(PyValueError::new_err(words.to_owned()));
+        if let Ok(text) = id.extract::<String>()
+            && text.contains('#')
+        {
+            if data.is_some() || extended.is_some() || dlc.is_some() || remote || fd || brs || esi {
+                return wrong(
+                    "'123#1122' is a whole frame already; give nothing else, or the identifier alone, as '123'",
+                );
+            }
+            return Self::parse(&text);
+        }
+        let id: Identifier = id.extract()?;
+        let id = identifier(id.raw, extended.or(id.extended))?;
         let dlc = dlc.map(|dlc| dlc.0);
         let data = data.map(|data| data.0).unwrap_or_default();
-        let wrong = |words: &str| Err(PyValueError::new_err(words.to_owned()));
         if fd || brs || esi {
             if remote {
                 return wrong("CAN FD has no remote frames");
@@ -136,10 +149,10 @@ impl Frame {
         Ok((py.get_type::<Self>().getattr("parse")?.unbind(), (self.0.to_string(),)))
     }
 
-    /// Parses a frame as can-utils writes it: `123#1122`, `00000123#R3`, `123##11122`.
+    /// Parses a frame as `cantap send` takes it: `123#1122`, `1#00`, `0x18FEF100#11.22`, `00000123#R3`, `123##11122`.
     #[staticmethod]
     fn parse(text: &str) -> PyResult<Self> {
-        let frame = text.parse::<TraceFrame>();
+        let frame = any_frame(text, false);
         frame.map(Self).map_err(|error| {
             // Somebody may have passed a whole file.
             let end = text.char_indices().nth(40).map_or(text.len(), |(at, _)| at);

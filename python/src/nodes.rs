@@ -7,14 +7,13 @@ use std::sync::{Arc, Mutex};
 use cantap_scripts::{Bench, Script, Simulation, library};
 use cantap_signals::Decoder;
 use cantap_trace::TraceRecord;
-use cantap_wire::Channel;
 use pyo3::prelude::*;
 
 use self::on_device::{OnDevice, SEED};
 use crate::database::Database;
 use crate::error::Error;
 use crate::frame::{AnyFrame, Record};
-use crate::number::Whole;
+use crate::grammar::{BitRate, OfDevice};
 
 /// Simulated buses have this bit rate unless the options fix another, in bit/s.
 const SIMULATED_BPS: u32 = 500_000;
@@ -27,11 +26,6 @@ enum Kind {
     Simulated(Box<Simulation>),
     Device(OnDevice),
     Closed,
-}
-
-fn channel_of(number: u8) -> PyResult<Channel> {
-    Channel::from_number(number)
-        .ok_or_else(|| Error::argument(format!("{number} is not a channel; those are 1 and 2")).into())
 }
 
 /// A ready node by its name after `node:`, or a script of one's own.
@@ -66,15 +60,15 @@ impl NodeBus {
     fn new(
         py: Python<'_>,
         address: Option<String>,
-        channel: Whole<u8>,
-        bitrate: Option<Whole<u32>>,
+        channel: OfDevice,
+        bitrate: Option<BitRate>,
         options: String,
         database: Option<&Database>,
     ) -> PyResult<Self> {
         let decoder = database
             .map_or_else(|| Arc::new(Decoder::new(Vec::new())), |database| Arc::clone(&database.decoder));
         let bitrate_bps = bitrate.map(|bitrate| bitrate.0);
-        let channel = channel_of(channel.0)?;
+        let channel = channel.0;
         let kind = match address {
             None => {
                 let bench = Bench {
@@ -117,8 +111,8 @@ impl NodeBus {
     }
 
     /// Sends a frame.
-    fn send(&self, py: Python<'_>, channel: Whole<u8>, frame: AnyFrame) -> PyResult<()> {
-        let (channel, frame) = (channel_of(channel.0)?, frame.classic("what a test sends")?);
+    fn send(&self, py: Python<'_>, channel: OfDevice, frame: AnyFrame) -> PyResult<()> {
+        let (channel, frame) = (channel.0, frame.classic("what a test sends")?);
         self.with(py, |kind| match kind {
             Kind::Simulated(simulation) => {
                 simulation.send(channel, frame);
@@ -134,11 +128,11 @@ impl NodeBus {
         &self,
         py: Python<'_>,
         handle: u32,
-        channel: Whole<u8>,
+        channel: OfDevice,
         frame: Option<AnyFrame>,
         period_ns: u64,
     ) -> PyResult<()> {
-        let channel = channel_of(channel.0)?;
+        let channel = channel.0;
         let frame = frame.map(|frame| frame.classic("what a test sends")).transpose()?;
         let repeated = frame.map(|frame| (channel, frame, period_ns));
         self.with(py, |kind| match kind {

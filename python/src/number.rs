@@ -1,7 +1,6 @@
 //! Numbers and other arguments from Python. What is out of range is a `ValueError`, and what has a wrong type a `TypeError` that says
-//! which argument it was.
+//! which argument it was. What users write in the command's grammar is in [`crate::grammar`].
 
-use cantap::Channel;
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 
@@ -44,49 +43,8 @@ where
     }
 }
 
-/// One of a device's channels, by its number.
-#[derive(Clone, Copy)]
-pub struct OfDevice(pub Channel);
-
-impl<'py> FromPyObject<'_, 'py> for OfDevice {
-    type Error = PyErr;
-
-    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        let number = match object.extract::<i64>() {
-            Ok(number) => number,
-            // A number all the same.
-            Err(error) if error.is_instance_of::<PyOverflowError>(object.py()) => -1,
-            Err(error) => return Err(error),
-        };
-        let found = Channel::ALL.into_iter().find(|channel| i64::from(channel.number()) == number);
-        found.map(Self).ok_or_else(|| {
-            PyValueError::new_err(format!("there is no channel {}; a device has 1 and 2", short(object)))
-        })
-    }
-}
-
-/// A channel of a trace, by its number: most count from 1, but some formats have a channel 0.
-#[derive(Clone, Copy)]
-pub struct OfTrace(pub u8);
-
-impl<'py> FromPyObject<'_, 'py> for OfTrace {
-    type Error = PyErr;
-
-    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        match object.extract::<u8>() {
-            Ok(number) => Ok(Self(number)),
-            Err(error) if !error.is_instance_of::<PyOverflowError>(object.py()) => Err(error),
-            _ => {
-                let words =
-                    format!("there is no channel {}; a trace's have numbers from 0 to 255", short(object));
-                Err(PyValueError::new_err(words))
-            }
-        }
-    }
-}
-
 /// A number in words, unless it has too many digits for a message.
-fn short(object: Borrowed<'_, '_, PyAny>) -> String {
+pub fn short(object: Borrowed<'_, '_, PyAny>) -> String {
     object
         .str()
         .map(|text| text.to_string())

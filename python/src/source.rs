@@ -1,9 +1,10 @@
 //! The requested records of a trace file.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use cantap_formats::time_range::{TimePoint, TimeRange};
-use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone};
+use cantap_formats::{Fault, Format, IndexFolder, ReadOptions, TraceReader, Zone};
 use cantap_signals::Decoder;
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{PlainFrame, TraceRecord};
@@ -12,8 +13,9 @@ use pyo3::prelude::*;
 use crate::channels::Named;
 use crate::database::Database;
 use crate::error::Error;
+use crate::grammar::OfTrace;
 use crate::inputs::TraceFile;
-use crate::number::{OfTrace, entry};
+use crate::number::entry;
 use crate::report::{Counts, Report};
 
 /// What to read from a file, as passed by the Python half.
@@ -28,6 +30,8 @@ pub struct Options {
     pub end: Option<String>,
     pub db: Option<Py<Database>>,
     pub signals: Vec<String>,
+    /// Where indexes of large files are; without it, where the user's are.
+    pub indexes: Option<PathBuf>,
 }
 
 impl<'py> FromPyObject<'_, 'py> for Options {
@@ -46,6 +50,7 @@ impl<'py> FromPyObject<'_, 'py> for Options {
             end: entry(object, "end", "end")?,
             db: entry(object, "db", "db")?,
             signals: entry(object, "signals", "signals")?,
+            indexes: if object.contains("indexes")? { entry(object, "indexes", "indexes")? } else { None },
         })
     }
 }
@@ -66,14 +71,14 @@ impl Options {
         Named::by("channel", self.channels.iter().copied()).into_iter().chain(database).collect()
     }
 
-    fn read(&self) -> Result<ReadOptions, Error> {
+    pub fn read(&self) -> Result<ReadOptions, Error> {
         let format = self.format.as_deref().map(str::parse::<Format>).transpose().map_err(Error::argument)?;
         let zone = self.zone.as_deref().map(str::parse::<Zone>).transpose().map_err(Error::argument)?;
         Ok(ReadOptions {
             format,
             strict: self.strict,
             zone: zone.unwrap_or_default(),
-            index: cantap_work::cache::indexes(),
+            index: self.indexes.clone().map(IndexFolder::new).or_else(cantap_work::cache::indexes),
             ..ReadOptions::default()
         })
     }

@@ -21,7 +21,8 @@ use crate::ahead::Ahead;
 use crate::channels::{Channels, Named};
 use crate::database::Database;
 use crate::error::Error;
-use crate::number::{OfTrace, Whole};
+use crate::grammar::{BitRate, OfTrace, Seconds};
+use crate::number::Whole;
 use crate::report::{Report, by_kind, from_json};
 use crate::scan::{warn, warn_if_nothing_decoded, warning};
 use crate::selection::{only, selection};
@@ -54,16 +55,17 @@ fn walk(
 pub fn stats(
     py: Python<'_>,
     options: Options,
-    bitrates: Vec<(Option<OfTrace>, Whole<u32>)>,
-    data_bitrates: Vec<(Option<OfTrace>, Whole<u32>)>,
-    window_s: f64,
+    bitrates: Vec<(Option<OfTrace>, BitRate)>,
+    data_bitrates: Vec<(Option<OfTrace>, BitRate)>,
+    window: Seconds,
 ) -> PyResult<Bound<'_, PyAny>> {
-    let all = |rates: &[(Option<OfTrace>, Whole<u32>)]| {
+    let all = |rates: &[(Option<OfTrace>, BitRate)]| {
         rates.iter().find(|(channel, _)| channel.is_none()).map(|(_, rate)| rate.0)
     };
-    let of_channels = |rates: &[(Option<OfTrace>, Whole<u32>)]| {
+    let of_channels = |rates: &[(Option<OfTrace>, BitRate)]| {
         rates.iter().filter_map(|(channel, rate)| Some(((*channel)?.0, rate.0))).collect::<Vec<_>>()
     };
+    let window_s = window.0;
     let window = Duration::try_from_secs_f64(window_s);
     let window = window.map_err(|_| Error::argument(format!("{window_s} s is not a valid window length")))?;
     let statistics = Statistics::new(StatOptions {
@@ -95,6 +97,22 @@ pub fn stats(
     summary["left_out"] = serde_json::to_value(&counts.left_out).unwrap_or_default();
     summary["missing_pct"] = counts.missing_pct().into();
     from_json(py, &summary.to_string())
+}
+
+/// Where a part of a trace begins and ends, in nanoseconds since 1970, and how many records it has.
+type TimePart = (Option<i64>, Option<i64>, u64);
+
+/// A trace as parts that follow each other in time; `None` if it is not to be divided.
+#[pyfunction]
+fn divide(
+    py: Python<'_>,
+    path: PathBuf,
+    options: Options,
+    part_bytes: u64,
+) -> PyResult<Option<Vec<TimePart>>> {
+    let read = options.read()?;
+    let found = py.detach(|| cantap_formats::divide(&path, &read, part_bytes)).map_err(Error::from)?;
+    Ok(found.map(|parts| parts.iter().map(|part| (part.start_ns, part.end_ns, part.records)).collect()))
 }
 
 /// What Python's half makes a mapping of: tables by name, and the events.
@@ -401,6 +419,7 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<Reading>()?;
     module.add_function(wrap_pyfunction!(is_trace_name, module)?)?;
     module.add_function(wrap_pyfunction!(decode_table, module)?)?;
+    module.add_function(wrap_pyfunction!(divide, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;
     module.add_function(wrap_pyfunction!(stats, module)?)?;
     module.add_function(wrap_pyfunction!(write, module)?)

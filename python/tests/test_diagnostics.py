@@ -1,5 +1,6 @@
 """ECUs of the virtual car, and bit rates that are found by listening."""
 
+import pathlib
 import pickle
 import threading
 
@@ -86,3 +87,83 @@ def test_a_silent_bus_has_no_bit_rate_and_says_what_to_check():
             device.autobaud(2, timeout=0.2)
         with pytest.raises(ValueError, match="time to wait"):
             device.autobaud(1, timeout=-1)
+
+
+DESCRIPTIONS = pathlib.Path(__file__).parents[2] / "host/protocols/tests/data"
+KINDS = DESCRIPTIONS / "kinds.odx-d"
+
+
+@pytest.fixture
+def described():
+    """An ECU that answers each request with this, and whoever asks it."""
+    with cantap.open("virtual:load=0,wire=joined", "500k", mode="normal") as device:
+        replies = []
+
+        def answering(frame):
+            for reply in replies:
+                reply.stop()
+            replies[:] = [device.reply(2, "7E0", frame)]
+
+        yield device.ecu(1, odx=KINDS, p2="10s"), answering
+
+
+def test_what_a_description_has_is_asked_by_name(described):
+    ecu, answering = described
+    answering("7E8#0462011178")
+    assert ecu.ask("read_temperature") == {"temperature": 20}
+    assert ecu.read_data("temperature") == ecu.read_data("0111") == ecu.read_data(0x111) == b"\x78"
+    answering("7E8#0662011CFFFE50")
+    assert ecu.ask("Read_Point") == {"point.x": -2, "point.y": 0}
+    answering("7E8#0562011C0102")
+    with pytest.warns(cantap.CantapWarning, match="read_point: point.y has no value: 62 01 1C 01 02"):
+        assert ecu.ask("read_point") == {"point.x": 258}
+    answering("7E8#037F2231")
+    with pytest.raises(cantap.NegativeResponse) as refusal:
+        ecu.ask("read_point")
+    assert refusal.value.code == 0x31
+
+
+def test_a_name_that_is_none_says_which_there_are(described):
+    ecu, _ = described
+    with pytest.raises(ValueError, match="there are: read_point"):
+        ecu.read_data("read_points")
+    with pytest.raises(ValueError, match="also needs to, gear"):
+        ecu.ask("Move to a place")
+    with cantap.open("virtual:load=0,wire=joined", 500_000, mode="normal") as device:
+        with pytest.raises(ValueError, match="odx="):
+            device.ecu(1).read_data("VIN")
+        with pytest.raises(ValueError, match="data identifier"):
+            device.ecu(1).read_data(0x10000)
+        somersault = DESCRIPTIONS / "somersault.pdx"
+        assert "07B:1C8" in repr(device.ecu(1, odx=somersault)) and "07B:1C8" in repr(device.ecu(1, odx=f"{somersault}:somersault_lazy"))
+        with pytest.raises(ValueError, match="no ECU of the description has 7E1:7E9"):
+            device.ecu(1, 0x7E1, odx=somersault)
+        with pytest.raises(cantap.DatabaseError, match="no layer nobody"):
+            device.ecu(1, odx=f"{somersault}:nobody")
+        with pytest.raises(FileNotFoundError):
+            device.ecu(1, odx="none.pdx")
+
+
+def test_descriptions_are_loaded_once(tmp_path):
+    odx = cantap.load_odx([KINDS, DESCRIPTIONS / "somersault.pdx"])
+    assert cantap.load_odx(odx) is odx and dict(odx.ecus)["somersault_base_variant"] == ["07B:1C8"]
+    request, missing = odx.requests("07B:1C8")["session_start"]
+    assert request[:1] == b"\x10" and missing == []
+    assert pickle.loads(pickle.dumps(odx)).ecus == odx.ecus and "somersault_base_variant" in repr(odx)
+    (tmp_path / "bad.odx-d").write_text("<ODX/>")
+    with pytest.raises(cantap.DatabaseError, match="bad.odx-d"):
+        cantap.load_odx(tmp_path / "bad.odx-d")
+    for wrong in ([], [""]):
+        with pytest.raises(ValueError):
+            cantap.load_odx(wrong)
+
+
+def test_a_bus_is_not_disturbed_by_accident_or_by_a_device_that_cannot():
+    with cantap.open("virtual:load=0", 500_000, mode="normal") as device:
+        with pytest.raises(ValueError, match="yes_on_a_test_bench"):
+            device.disturb(1, "100ms")
+        with pytest.raises(cantap.DeviceError, match="does not disturb a bus"):
+            device.disturb("can0", "100ms", yes_on_a_test_bench=True)
+        for wrong in ({}, {"at": "1ms", "id": "123"}, {"at": "never"}, {"id": "12G"}):
+            with pytest.raises(ValueError):
+                device.disturb(1, **wrong, yes_on_a_test_bench=True)

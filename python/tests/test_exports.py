@@ -95,3 +95,77 @@ def test_the_dashboard_asks_for_figures_that_the_server_has():
     assert labels <= {"board", "channel", "stage"}
     places = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in dashboard["panels"]]
     assert len(set(places)) == len(places) and len({panel["id"] for panel in dashboard["panels"]}) == len(places)
+
+
+TIME = re.compile(r"\$__timeFilter\((\w+)\)")
+LAKE_BOARD = REPOSITORY / "docs/clients/grafana-lake.json"
+
+
+def filled(query, values, begin="2026-03-01", end="2026-03-03"):
+    """A query as Grafana sends it: its variables are lists of texts, and the source's macro a condition on a time."""
+    query = re.sub(r"\$\{(\w+):singlequote\}", lambda found: ",".join("'" + value.replace("'", "\\'") + "'" for value in values[found[1]]), query)
+    query = TIME.sub(rf"\1 >= '{begin}T00:00:00Z' AND \1 <= '{end}T00:00:00Z'", query)
+    assert "$" not in query
+    return query
+
+
+def fetched(answer):
+    """Its rows, through Arrow: DuckDB's own need another package for times with a zone."""
+    return [tuple(row.values()) for row in pa.table(answer).to_pylist()]
+
+
+@pytest.fixture
+def database(lake, capsys):
+    duckdb = pytest.importorskip("duckdb")
+    assert command.main(["views", str(lake)]) == 0
+    connection = duckdb.connect()
+    connection.execute(capsys.readouterr().out)
+    return connection
+
+
+def test_the_dashboard_of_a_lake_asks_for_what_the_views_have(lake, database):
+    dashboard = json.loads(LAKE_BOARD.read_text())
+    values = {}
+    for variable in dashboard["templating"]["list"][1:]:
+        values[variable["name"]] = [row[0] for row in database.execute(filled(variable["query"], values)).fetchall()]
+    assert values == {"vehicle": ["a =,b"], "message": ["Engine", "Other"], "signal": ["Gear", "Ratio", "Speed"]}
+    answers = {}
+    for panel in dashboard["panels"]:
+        [target] = panel["targets"]
+        answer = database.sql(filled(target["rawSql"], values))
+        names = answer.columns
+        answers[panel["title"]] = fetched(answer)
+        is_series = target["format"] == 0
+        assert (names[:2] == ["time", "metric"]) == is_series == (panel["type"] == "timeseries")
+    rows = Store(lake).dataset("signals").to_table().to_pylist()
+    assert len(answers["Signals"]) == sum(row["event"] == "value" for row in rows)
+    assert {metric for _, metric, _ in answers["Signals"]} >= {"a =,b Engine.Speed km/h", "a =,b Engine.Gear"}
+    assert sum(row[2] for row in answers["Frames"]) == 3 and answers["Traces"] == [("read", 1)]
+    assert [row[1].startswith("a =,b lost") for row in answers["Losses, errors, states"]] == [True]
+    places = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in dashboard["panels"]]
+    assert len(set(places)) == len(places) and len({panel["id"] for panel in dashboard["panels"]}) == len(places)
+    # Nothing outside of the time that is shown.
+    assert fetched(database.sql(filled(dashboard["panels"][3]["targets"][0]["rawSql"], values, "2020-01-01", "2020-01-02"))) == []
+
+
+def test_views_have_the_rows_of_the_ledger_and_the_types_of_the_tables(lake, database, tmp_path, capsys):
+    for table in ("frames", "signals"):
+        expected = Store(lake).dataset(table).to_table()
+        found = pa.table(database.sql(f"select * from {table}"))
+        assert found.column_names == expected.column_names and found.num_rows == expected.num_rows
+    # What the ledger does not name is no part of it.
+    stray = next((lake / "frames").rglob("*.parquet"))
+    (stray.parent / "stray.parquet").write_bytes(stray.read_bytes())
+    assert database.execute("select count(*) from frames").fetchone() == (4,)
+    # A lake without traces has the same columns.
+    Store(tmp_path / "empty lake's").create()
+    assert command.main(["views", str(tmp_path / "empty lake's")]) == 0
+    import duckdb
+
+    empty = duckdb.connect()
+    empty.execute(capsys.readouterr().out)
+    for view in ("frames", "signals", "ledger"):
+        kinds = [[(row[0], row[1]) for row in connection.execute(f"describe {view}").fetchall()] for connection in (database, empty)]
+        assert kinds[0] == kinds[1] and empty.execute(f"select count(*) from {view}").fetchone() == (0,)
+    Store(tmp_path / "l[a]ke").create()
+    assert command.main(["views", str(tmp_path / "l[a]ke")]) == 1 and "pattern" in capsys.readouterr().err

@@ -38,7 +38,7 @@ def decode(tmp_path):
         rows = tmp_path / "rows.arrow"
         request = {
             "path": str(log), "trace": "001/drive.log", "vehicle": "001", "bytes": log.stat().st_size, "databases": databases,
-            "database_names": names, "j1939": False, "signals": list(signals), "zone": None, "rows": str(rows), "stem": None, "part": None,
+            "database_names": names, "j1939": False, "signals": list(signals), "zone": None, "rows": str(rows), "stem": None, "part": None, "divide": None,
         }  # fmt: skip
         entry, _ = decoding.decode(request)
         with pa.memory_map(str(rows)) as file, pa.ipc.open_stream(file) as reader:
@@ -95,7 +95,7 @@ def test_files_have_the_rows_of_the_stream(tmp_path):
     database.write_text(DBC.format(id=0x123) + 'VAL_ 291 Speed 1 "one" 170 "much" ;\n')
     request = {
         "path": str(log), "trace": "001/drive.log", "vehicle": "1/ä", "bytes": 1, "databases": [(None, str(database))],
-        "database_names": ["car.dbc"], "j1939": False, "signals": [], "zone": None, "part": None,
+        "database_names": ["car.dbc"], "j1939": False, "signals": [], "zone": None, "part": None, "divide": None,
     }  # fmt: skip
     rows, folder = tmp_path / "rows.arrow", tmp_path / "files"
     entry, none = decoding.decode({**request, "rows": str(rows), "stem": None})

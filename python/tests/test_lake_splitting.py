@@ -62,11 +62,45 @@ def test_a_log_in_parts_has_the_rows_of_the_whole(tmp_path, database):
     assert ratio > 1.5 and entry["state"] == "read" and len(rows[0]) == FRAMES
 
 
-def test_what_depends_on_what_comes_before_is_read_as_one(tmp_path, database):
-    """The channels of these interfaces follow from the order in which they come."""
-    trace = log(tmp_path / "drive.log", names=("can0", "vcan0", "engine"))
-    ratio, _ = same(trace, tmp_path, database, trace.stat().st_size // 5)
-    assert ratio == 1
+@pytest.mark.parametrize("name", ["drive.mf4", "drive.asc", "drive.trc", "drive.pcapng", "other.log", "full.csv"])
+def test_other_formats_are_divided_by_times(tmp_path, database, name):
+    """One reading finds the times: MF4's groups are merged by time, and a text's lines mean the same in each part."""
+    source = log(tmp_path / "other.log", names=("can0", "vcan0", "engine") if name == "other.log" else ("can0", "can1"))
+    trace = tmp_path / name
+    if trace != source:
+        cantap.write(cantap.read(source), trace, format="csv-full" if name == "full.csv" else None)
+    ratio, (rows, [entry]) = same(trace, tmp_path, database, trace.stat().st_size // 5)
+    assert ratio > 1.5 and entry["state"] == "read" and len(rows[0]) == entry["records"] > FRAMES // 2
+
+
+def test_a_trace_whose_records_are_in_no_order_is_read_as_one(tmp_path, database):
+    lines = log(tmp_path / "drive.log").read_text().splitlines()
+    lines.insert(len(lines), lines[0])
+    (tmp_path / "loop.log").write_text("\n".join(lines).replace("can7", "engine") + "\n")
+    ratio, (rows, _) = same(tmp_path / "loop.log", tmp_path, database, (tmp_path / "loop.log").stat().st_size // 5)
+    assert ratio == 1 and rows[0][-1]["time"] == rows[0][0]["time"]
+
+
+def test_a_large_mf4_is_read_by_its_index(tmp_path, database):
+    """32 MiB and more have one: a worker then reads its part, and not the whole file."""
+    import numpy as np
+
+    count = 1_200_000
+    frames = {
+        "time": pa.array(np.arange(count) * 20_000 + 1_772_409_590 * 10**9, pa.timestamp("ns", "UTC")),
+        "id": pa.array(np.where(np.arange(count) % 1000, 0x124, 0x123), pa.uint32()),
+        "data": pa.array([bytes([at & 255]) * 8 for at in range(256)] * (count // 256) + [bytes(8)] * (count % 256), pa.binary()),
+    }
+    cantap.write(frames, tmp_path / "drive.mf4")
+    size = (tmp_path / "drive.mf4").stat().st_size
+    assert size > 32 << 20
+    parts = list(cantap._native.divide(tmp_path / "drive.mf4", {**options(tmp_path / "drive.mf4"), "indexes": str(tmp_path / "indexes")}, size // 4))
+    assert len(parts) >= 4 and sum(records for _, _, records in parts) == count
+    assert len(list((tmp_path / "indexes").iterdir())) == 1
+
+
+def options(path):
+    return cantap.traces._options(path, None, (), (), (), None, None, None, None, False)
 
 
 @pytest.mark.parametrize("kind", ["cut", "damaged", "line"])

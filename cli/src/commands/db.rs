@@ -65,7 +65,7 @@ fn of_coverage(arg: Arg) -> Arg {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let is_odx = |path: &PathBuf| path.to_str().is_some_and(crate::protocols::is_odx);
+    let is_odx = |path: &PathBuf| path.to_str().is_some_and(cantap_work::odx::is_odx);
     if args.files.iter().any(is_odx) {
         anyhow::ensure!(
             args.files.iter().all(is_odx) && args.messages.is_empty() && args.coverage.is_none(),

@@ -22,11 +22,11 @@ use self::names::{Identifier, identifier};
 use self::scan::ScanArgs;
 use self::script::{RunArgs, Step};
 pub use self::transfer_args::TransferArgs;
-use crate::protocols::{OdxPath, load_odx};
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
 use cantap_work::interrupt;
+use cantap_work::odx::{self, OdxPath};
 use cantap_work::uds::{Client, REFUSAL};
 
 /// The command line.
@@ -192,7 +192,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         what => vec![Step { place: None, what: what.clone() }],
     };
-    let descriptions = load_odx(&args.odx, false)?;
+    let descriptions = odx::load(&args.odx, &stderr::reporter())?;
     let options = args.transfer.options(descriptions.as_deref().and_then(only_pair));
     let Pair { a, b } = options.pair;
     let ecu = descriptions.as_ref().and_then(|descriptions| descriptions.of(Some(a), Some(b)));

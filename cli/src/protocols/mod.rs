@@ -2,7 +2,6 @@
 //! protocols.
 
 mod known;
-mod odx;
 mod sheet;
 
 use std::sync::Arc;
@@ -11,11 +10,12 @@ use cantap_protocols::Options;
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
+use cantap_work::odx::{self, OdxPath};
 use cantap_work::reading::Reading;
+use cantap_work::report::Reporter;
 use clap::Arg;
 
 pub use self::known::{Known, named};
-pub use self::odx::{OdxPath, is_odx, load as load_odx, read as read_odx};
 pub use self::sheet::SheetPath;
 
 use crate::stderr;
@@ -53,11 +53,16 @@ impl ProtocolArgs {
     /// `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
         let sheets = self.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
-        let descriptions = load_odx(&self.odx, quiet)?;
+        let descriptions = odx::load(&self.odx, &reporter(quiet))?;
         let mut pairs = self.pairs.clone();
         pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
         Ok(Options { pairs, sheets, descriptions, ..Options::default() })
     }
+}
+
+/// What the libraries report goes to standard error, unless `quiet`.
+fn reporter(quiet: bool) -> Reporter {
+    if quiet { Reporter::silent() } else { stderr::reporter() }
 }
 
 /// [`ProtocolArgs`] mean something with `--protocols` only. For `Command::mut_args` of a command that has it.

@@ -7,8 +7,8 @@
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
-//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`] | frames and their fate; a protocol's client on a device |
-//! | [`changing`] | messages whose values change with time |
+//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`odx`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
+//! | [`changing`], [`disturbance`] | messages whose values change with time; error frames on purpose |
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
 //! | [`recording`] | a trace that grows, or waits for a condition |
@@ -47,6 +47,8 @@ pub mod databases;
 #[cfg(feature = "dfu")]
 pub mod dfu;
 #[cfg(feature = "buses")]
+pub mod disturbance;
+#[cfg(feature = "buses")]
 pub mod doctor;
 #[cfg(feature = "buses")]
 pub mod gateway;
@@ -62,6 +64,8 @@ mod meter;
 pub mod missing;
 #[cfg(feature = "buses")]
 pub mod node_text;
+#[cfg(feature = "buses")]
+pub mod odx;
 #[cfg(target_os = "linux")]
 pub mod port_access;
 #[cfg(feature = "buses")]

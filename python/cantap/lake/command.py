@@ -10,13 +10,14 @@ from contextlib import nullcontext, suppress
 
 import pyarrow.compute as pc
 
-from .._native import CantapError
+from .._native import CantapError, seconds
 from . import influx
 from .compaction import FILE_BYTES, compact, vacuum
 from .ingest import ingest
 from .ledger import FAILED, REFUSED
 from .store import Store, StoreError
 from .transactions import Busy
+from .views import views
 from .writing import TABLES
 
 
@@ -32,8 +33,8 @@ def _parser() -> argparse.ArgumentParser:
     add.add_argument("--vehicle", metavar="NAME", help="whose traces they are [default: the folder that they are in]")
     add.add_argument("--zone", help="of dates in traces that name none, such as Europe/Berlin [default: UTC]")
     add.add_argument("--workers", metavar="N", type=_count, help="how many traces at a time [default: as many as there are processors]")
-    add.add_argument("--timeout", metavar="SECONDS", type=_seconds, default=3600.0, help="longest time for one trace [default: 3600]")
-    add.add_argument("--split", metavar="SIZE", type=_size_or_none, help="length of the parts in which all workers read a large BLF file or candump log; 0: never")
+    add.add_argument("--timeout", metavar="TIME", type=_seconds, default=3600.0, help="longest time for one trace, in seconds or as 2h [default: 1h]")
+    add.add_argument("--split", metavar="SIZE", type=_size_or_none, help="length of the parts in which all workers read a large trace; 0: never")
     add.add_argument("--retry", action="store_true", help="also those that were refused before")
     ledger = commands.add_parser("ledger", help="what became of each trace, a line of JSON each")
     ledger.add_argument("lake")
@@ -43,6 +44,8 @@ def _parser() -> argparse.ArgumentParser:
     lines.add_argument("--message", metavar="NAME", action="append", default=[], help="only this message; can be repeated")
     delta = commands.add_parser("delta", help="make the tables Delta tables, too, of the files that they have now")
     delta.add_argument("lake")
+    sql = commands.add_parser("views", help="print SQL that makes views of the tables and the ledger in a database of DuckDB")
+    sql.add_argument("lake")
     joining = commands.add_parser("compact", help="join small files of the same vehicle, day and channel; rows and ledger stay the same")
     joining.add_argument("lake")
     default = f"{FILE_BYTES >> 20}M"
@@ -65,12 +68,12 @@ def _count(text: str) -> int:
 
 def _seconds(text: str) -> float:
     try:
-        seconds = float(text)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < 1e9:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a time; give seconds, more than 0")
-    return seconds
+        time = seconds(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    if not 0 < time < 1e9:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time; give more than 0")
+    return time
 
 
 def _hours(text: str) -> float:
@@ -186,6 +189,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _compact(chosen)
         if chosen.command == "vacuum":
             print(f"{len(vacuum(chosen.lake, retain_hours=chosen.older_than))} files removed")
+            return 0
+        if chosen.command == "views":
+            print(views(Store(chosen.lake)), end="")
             return 0
         if chosen.command == "delta":
             for table in TABLES:

@@ -20,6 +20,7 @@ from typing import Any, TypedDict
 
 import cantap
 import pyarrow as pa
+from cantap import _native, traces
 
 from . import columns
 from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, UNDECODED, Entry
@@ -30,9 +31,13 @@ from .writing import Writing
 class Part(TypedDict):
     """One of several parts of a trace."""
 
-    format: str
-    #: As `splitting` has them.
-    pieces: list[Any]
+    format: str | None
+    #: As `splitting` has them; `None`: the part is what is between two times.
+    pieces: list[Any] | None
+    #: From a time to before another, in nanoseconds since 1970; `None`: from the beginning, to the end.
+    window: tuple[int | None, int | None]
+    #: Where the trace's index is.
+    indexes: str | None
     #: How many rows of frames and signals the parts before it have; `None`: rows are only counted.
     first_rows: tuple[int, int] | None
 
@@ -58,6 +63,8 @@ class Request(TypedDict):
     stem: str | None
     #: All of it, if `None`.
     part: Part | None
+    #: Nothing is decoded: only the times are found that divide the trace into parts of so many bytes; their index goes into this folder.
+    divide: tuple[int, str] | None
 
 
 #: Databases that stay loaded: a task's traces are mostly of one vehicle.
@@ -154,7 +161,7 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
                 decoding, unusable = _decoding(request, again)
             # How many records there are, this says as well.
             if decoding is None:
-                scan = cantap.scan(source, zone=request["zone"], format=_format(request))
+                scan = _scan(request, source)
                 records, report, read = _write(rows, scan, "frames", first_rows[0]), scan.report, source
                 if not isinstance(rows, _Counted):
                     decoding, unusable = _decoding(request, again)
@@ -194,17 +201,35 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
     return entry
 
 
-def _format(request: Request) -> str | None:
-    return request["part"]["format"] if request["part"] else None
+def _scan(request: Request, source: Any, db: cantap.Database | None = None, signals: Sequence[str] = ()) -> cantap.Scan:
+    part = request["part"]
+    options = traces._options(source, db, signals, (), (), None, None, part["format"] if part else None, request["zone"], False)
+    if part:
+        options["start"], options["end"] = (None if ns is None else traces._date_text(traces._EPOCH, ns) for ns in part["window"])
+        if part["indexes"]:
+            options["indexes"] = part["indexes"]
+    return cantap.Scan(options, traces.BATCH_ROWS)
+
+
+def _divided(request: Request) -> dict[str, Any]:
+    """The times that divide a trace, and how many records each part has."""
+    assert request["divide"] is not None
+    part_bytes, indexes = request["divide"]
+    options = traces._options(request["path"], None, (), (), (), None, None, None, request["zone"], False)
+    try:
+        return {"parts": _native.divide(request["path"], {**options, "indexes": indexes}, part_bytes)}
+    except (cantap.CantapError, OSError):
+        # Whoever reads it says what is wrong.
+        return {"parts": None}
 
 
 @contextmanager
 def _source(request: Request) -> Iterator[Any]:
     part = request["part"]
-    if part is None:
+    if part is None or part["pieces"] is None:
         yield request["path"]
         return
-    pieces = Pieces(request["path"], part["pieces"], request["path"], part["format"])
+    pieces = Pieces(request["path"], part["pieces"], request["path"], part["format"] or "")
     try:
         yield pieces
     finally:
@@ -217,7 +242,7 @@ def _decoding(request: Request, source: Any) -> tuple[cantap.Scan | None, str | 
         database = _databases(request)
         if database is None:
             return None, None
-        return cantap.scan(source, zone=request["zone"], format=_format(request), db=database, signals=request["signals"]), None
+        return _scan(request, source, db=database, signals=request["signals"]), None
     except cantap.DatabaseError as error:
         return None, f"no signals: {_in_words(error, request)}"
 
@@ -269,6 +294,9 @@ def main() -> None:
     # Faults in a trace are in the ledger.
     warnings.simplefilter("ignore", cantap.CantapWarning)
     for request in _requests(sys.argv[1:]):
+        if request["divide"] is not None:
+            print(json.dumps(_divided(request)), flush=True)
+            continue
         entry, files = decode(request)
         print(json.dumps({**entry.to_dict(), "files": files} if files else entry.to_dict()), flush=True)
 

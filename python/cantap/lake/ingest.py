@@ -206,28 +206,44 @@ class _Run:
         self._count(trace, answer["state"], answer["problem"], answer["records"])
 
     def _in_parts(self, trace: Trace, fetched: Fetched, stem: str, staged: Path, divided: Divided) -> dict[str, Any] | None:
-        """The entry of a large trace, whose rows are then in files below `staged`; `None` if it is to be read as one.
+        """The entry of a large trace, whose rows are then in files below `staged`; `None` if it is to be read as one."""
+        part_bytes = divided.part_bytes(fetched.bytes)
+        if (found := divide(fetched.path, part_bytes)) is not None:
+            of_file: list[Part] = [
+                {"format": found.format, "pieces": list(pieces), "window": (None, None), "indexes": None, "first_rows": None} for pieces in found.parts
+            ]
+            if (entry := self._of_parts(trace, fetched, stem, staged, divided, of_file, None)) is not None:
+                return entry
+        indexes = staged / "indexes"
+        windows = self._place().divide(trace, fetched, part_bytes, indexes)
+        if windows is None:
+            return None
+        by_time: list[Part] = [
+            {"format": None, "pieces": None, "window": (start_ns, end_ns), "indexes": str(indexes), "first_rows": None} for start_ns, end_ns, _ in windows
+        ]
+        return self._of_parts(trace, fetched, stem, staged, divided, by_time, [records for _, _, records in windows])
+
+    def _of_parts(
+        self, trace: Trace, fetched: Fetched, stem: str, staged: Path, divided: Divided, parts: list[Part], records: list[int] | None
+    ) -> dict[str, Any] | None:
+        """The same of these parts; `records`: how many each has, if it was divided by time.
 
         All rows are counted first: a row has its number, which depends on the parts before.
         """
-        found = divide(fetched.path, divided.part_bytes(fetched.bytes))
-        if found is None:
-            return None
 
         def read(number: int, first_rows: tuple[int, int] | None) -> dict[str, Any]:
-            part: Part = {"format": found.format, "pieces": list(found.parts[number]), "first_rows": first_rows}
             place = self._place()
-            answer = place.decode(trace, fetched, f"{stem}.{number:04}", part)
+            answer = place.decode(trace, fetched, f"{stem}.{number:04}", {**parts[number], "first_rows": first_rows})
             for files in answer.get("files", {}).values():
                 for name in files:
                     (staged / name).parent.mkdir(parents=True, exist_ok=True)
                     os.replace(place.written / name, staged / name)
             return answer
 
-        numbers = range(len(found.parts))
+        numbers = range(len(parts))
         counts = [Entry(**answer) for answer in divided.pool.map(read, numbers, [None for _ in numbers])]
-        whole = together(counts)
-        if whole is None:
+        whole = together(counts, is_by_time=records is not None)
+        if whole is None or records not in (None, [entry.records for entry in counts]):
             return None
         first_rows = [(0, 0)]
         for entry in counts:
@@ -283,7 +299,22 @@ class _Workplace:
         # What a process left that was ended.
         shutil.rmtree(self.written, ignore_errors=True)
         self.written.mkdir(parents=True)
-        request: Request = {
+        try:
+            return self._process.ask(self._request(trace, fetched, stem, part, None))
+        except Failed as failed:
+            return Entry(trace.name, trace.vehicle, fetched.bytes, state=FAILED, problem=str(failed)).to_dict()
+
+    def divide(self, trace: Trace, fetched: Fetched, part_bytes: int, indexes: Path) -> list[tuple[int | None, int | None, int]] | None:
+        """The parts of a trace by time: from, to, records. `None` if it is to be read as one."""
+        try:
+            answer = self._process.ask(self._request(trace, fetched, "", None, (part_bytes, str(indexes))))
+        except Failed:
+            return None
+        parts = answer["parts"]
+        return None if parts is None else [(start_ns, end_ns, records) for start_ns, end_ns, records in parts]
+
+    def _request(self, trace: Trace, fetched: Fetched, stem: str, part: Part | None, divide: tuple[int, str] | None) -> Request:
+        return {
             "path": str(fetched.path),
             "trace": trace.name,
             "vehicle": trace.vehicle,
@@ -296,8 +327,5 @@ class _Workplace:
             "rows": str(self.written),
             "stem": stem,
             "part": part,
+            "divide": divide,
         }
-        try:
-            return self._process.ask(request)
-        except Failed as failed:
-            return Entry(trace.name, trace.vehicle, fetched.bytes, state=FAILED, problem=str(failed)).to_dict()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import posixpath
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from .._sources import files, in_order
+from .._sources import file_system, files, in_order, is_url, opener, own_file
 
 CHUNK_BYTES = 1 << 20
 
@@ -29,8 +30,8 @@ class Trace:
         """Its content: a file of the system stays where it is, another is copied into the folder."""
         digest = hashlib.sha256()
         is_local = isinstance(self.source, str)
-        # The suffix determines the format.
-        path = Path(self.source) if is_local else folder / posixpath.basename(self.name)
+        # The suffix determines the format. The rest of an object's name may be anything: longer than a file's, or `..`.
+        path = Path(self.source) if is_local else folder / f"trace{_suffixes(self.name)}"
         before = _stamp(path) if is_local else None
         size = 0
         file = open(path, "rb") if is_local else self.source()
@@ -69,6 +70,12 @@ class Fetched:
             self.path.unlink(missing_ok=True)
 
 
+def _suffixes(name: str) -> str:
+    """`.log.gz` of `drive 7.log.gz`; empty if what is there is no suffix."""
+    found = re.search(r"(\.[A-Za-z0-9_-]{1,16}){1,2}$", posixpath.basename(name))
+    return found[0] if found else ""
+
+
 def _stamp(path: Path) -> tuple[int, int]:
     about = path.stat()
     return about.st_size, about.st_mtime_ns
@@ -89,6 +96,10 @@ def traces(sources: Iterable[str], vehicle: str | None = None) -> list[Trace]:
                 first = parts[0] if len(parts) > 1 else folder.resolve().name
                 found[str(path)] = Trace(str(path), vehicle or first, str(path))
             continue
+        if is_url(source) and (of_folder := _below(source)) is not None:
+            for below_it, (name, opened) in of_folder:
+                found[name] = Trace(name, vehicle or below_it[0], opened)
+            continue
         for file in files(source):
             name, opened = file if isinstance(file, tuple) else (os.fspath(file), os.fspath(file))
             above = posixpath.basename(posixpath.dirname(name.replace(os.sep, "/")))
@@ -96,3 +107,20 @@ def traces(sources: Iterable[str], vehicle: str | None = None) -> list[Trace]:
     return list(found.values())
 
 
+def _below(url: str) -> list[tuple[list[str], tuple[str, Any]]] | None:
+    """All files below a folder of fsspec, hidden ones apart: the parts of each one's name from the folder on, beginning with the folder's own name if it lies
+    directly in it; `None` if it is no folder."""
+    system, path = file_system(url)
+    if not system.isdir(path):
+        return None
+    path = path.rstrip("/")
+    own = posixpath.basename(path) or "unknown"
+    found = [([posixpath.basename(posixpath.dirname(name)) or "unknown"], opener(system, name)) for name in own_file(system, path)]
+    for name in sorted(system.find(path), key=in_order):
+        parts = [part for part in name[len(path) :].split("/") if part]
+        # An object whose name ends like a folder's is what some programs make of an empty folder.
+        if parts and name != path and not parts[-1].startswith(".") and not name.endswith("/"):
+            found.append((parts if len(parts) > 1 else [own, *parts], opener(system, name)))
+    if not found:
+        raise FileNotFoundError(f"there is no file below {url}")
+    return found

@@ -1,4 +1,7 @@
-"""Divides one large trace into parts that are decoded independently of each other, without anybody reading all of it.
+"""Divides one large trace into parts that are decoded independently of each other.
+
+BLF and candump's logs are divided here, without anybody reading all of them; what has another format, by times that one reading of the whole trace
+finds (`cantap_formats::divide`), whose index then leads each worker straight to its part.
 
 BLF: between two objects of its containers, the second of which is a frame. candump's logs: between two lines. A part is a list of pieces: ranges of
 the file, and bytes that are in none, such as BLF's head. Whether a part was divided rightly shows when it is read: it ends with its last object or
@@ -229,8 +232,9 @@ class Pieces:
         self._file.close()
 
 
-def together(entries: Sequence[Entry]) -> Entry | None:
-    """The entry of a trace whose parts have these; `None` if one is not as it should be, so that the trace is to be read as one."""
+def together(entries: Sequence[Entry], is_by_time: bool) -> Entry | None:
+    """The entry of a trace whose parts have these; `None` if one is not as it should be, so that the trace is to be read as one. What is left out is
+    that of the whole trace already if it was divided by time."""
     if any(entry.state not in (READ, UNDECODED, EMPTY) or entry.issues for entry in entries):
         return None
     whole = Entry(**entries[0].to_dict())
@@ -238,7 +242,7 @@ def together(entries: Sequence[Entry]) -> Entry | None:
         for count in ("records", "frames", "lost", "bus_errors", "decoded", "signal_rows"):
             setattr(whole, count, getattr(whole, count) + getattr(entry, count))
         whole.lost_at_least |= entry.lost_at_least
-        for kinds, more in ((whole.left_out, entry.left_out), (whole.notes, entry.notes)):
+        for kinds, more in () if is_by_time else ((whole.left_out, entry.left_out), (whole.notes, entry.notes)):
             for what, number in more.items():
                 kinds[what] = kinds.get(what, 0) + number
     if entries[0].coverage is not None:

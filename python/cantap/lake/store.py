@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import pyarrow as pa
 import pyarrow.dataset
@@ -235,7 +236,10 @@ class Store:
 
     def write_delta(self, table: str) -> int:
         """Makes a table a Delta table, too, of the files that it has now, in one transaction; returns its version. Nothing is copied. It needs the
-        package `deltalake`."""
+        package `deltalake`.
+
+        A version has what came since the last one. Only if files are gone, as after a compaction or with another database, it lists all of them again.
+        """
         try:
             import deltalake
             from deltalake.transaction import AddAction, create_table_with_add_actions
@@ -243,19 +247,31 @@ class Store:
             raise ModuleNotFoundError("Delta is written by deltalake; install it: pip install deltalake", name="deltalake") from error
         folder = self.folder / table
         schema = deltalake.Schema.from_arrow(columns.schema(TABLES[table]))
-        actions: list[Any] = []
-        for name, rows in self._files_as_said(table).items():
-            about = self.path(name).stat()
-            path = self.path(name).relative_to(folder).as_posix()
-            actions.append(AddAction(path, about.st_size, {}, int(about.st_mtime * 1000), True, json.dumps({"numRecords": rows})))
-        if deltalake.DeltaTable.is_deltatable(str(folder)):
-            delta = deltalake.DeltaTable(str(folder))
-            delta.create_write_transaction(actions, "overwrite", schema)
-            delta.update_incremental()
-            return int(delta.version())
-        folder.mkdir(exist_ok=True)
-        create_table_with_add_actions(str(folder), schema, actions, "error", name=table)
-        return int(deltalake.DeltaTable(str(folder)).version())
+        files = {name.removeprefix(f"{table}/"): rows for name, rows in self._files_as_said(table).items()}
+
+        def added(names: Iterable[str]) -> list[Any]:
+            actions = []
+            for name in names:
+                about = self.path(f"{table}/{name}").stat()
+                actions.append(AddAction(name, about.st_size, {}, int(about.st_mtime * 1000), True, json.dumps({"numRecords": files[name]})))
+            return actions
+
+        if not deltalake.DeltaTable.is_deltatable(str(folder)):
+            folder.mkdir(exist_ok=True)
+            create_table_with_add_actions(str(folder), schema, added(files), "error", name=table)
+            return int(deltalake.DeltaTable(str(folder)).version())
+        delta = deltalake.DeltaTable(str(folder))
+        # The log has them as they are in a URL.
+        known = {unquote(path) for path in pa.table(delta.get_add_actions(flatten=True)).column("path").to_pylist()}
+        if known <= files.keys():
+            new = [name for name in files if name not in known]
+            if not new:
+                return int(delta.version())
+            delta.create_write_transaction(added(new), "append", schema)
+        else:
+            delta.create_write_transaction(added(files), "overwrite", schema)
+        delta.update_incremental()
+        return int(delta.version())
 
     def problems(self) -> Iterator[str]:
         """What of the ledger is not there as it says: each file's rows are counted."""

@@ -2,6 +2,7 @@
 
 use pyo3::prelude::*;
 
+use crate::grammar::BitRate;
 use crate::number::{Whole, entry};
 
 /// How to open a channel, as passed by the Python half.
@@ -24,7 +25,7 @@ impl<'py> FromPyObject<'_, 'py> for ChannelOptions {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        let bitrate: Option<Whole<u32>> = entry(object, "bitrate", "bitrate")?;
+        let bitrate: Option<BitRate> = entry(object, "bitrate", "bitrate")?;
         let sjw: Option<Whole<u8>> = entry(object, "sjw", "sjw")?;
         let segments: Option<Segments> = entry(object, "segments", "segments")?;
         Ok(Self {

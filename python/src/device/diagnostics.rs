@@ -20,7 +20,7 @@ use super::session::{HowToSend, Sending, Session};
 use super::transmissions::NOBODY;
 use super::waiting::{duration, signals};
 use crate::error::Error;
-use crate::number::OfDevice;
+use crate::grammar::{OfDevice, Seconds};
 
 /// Records that may wait while Python handles a signal.
 const CAPACITY: usize = 1 << 16;
@@ -202,11 +202,11 @@ fn ask_ecu<'py>(
     pair: &str,
     is_to_all: bool,
     data: Vec<u8>,
-    times: (f64, f64, f64),
+    times: (Seconds, Seconds, Seconds),
     padding: Option<u8>,
 ) -> PyResult<Vec<(String, Bound<'py, PyBytes>)>> {
     let session = device.get().session()?;
-    let (p2, p2_star, patience) = (duration(times.0)?, duration(times.1)?, duration(times.2)?);
+    let (p2, p2_star, patience) = (duration(times.0.0)?, duration(times.1.0)?, duration(times.2.0)?);
     let pair = pair.parse::<Pair>().map_err(Error::argument)?;
     if data.is_empty() {
         return Err(Error::argument("a request has at least one byte, its service").into());

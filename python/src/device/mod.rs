@@ -2,9 +2,11 @@
 
 mod channel_options;
 pub mod diagnostics;
+pub mod disturb;
 mod fanout;
 mod gateway;
 mod lock;
+pub mod odx;
 mod records;
 mod session;
 mod tasks;
@@ -38,7 +40,8 @@ use self::transmissions::{NOBODY, SenderId};
 use self::waiting::{duration, signals};
 use crate::error::{DeviceError, Error};
 use crate::frame::AnyFrame;
-use crate::number::{OfDevice, Whole};
+use crate::grammar::{OfDevice, Seconds};
+use crate::number::Whole;
 use crate::report::from_json;
 
 /// A device in a session of this program.
@@ -182,9 +185,9 @@ impl Device {
     }
 
     /// Finds the bit rate of a closed channel's bus, in bit/s.
-    fn autobaud(&self, py: Python<'_>, number: OfDevice, silence: f64) -> PyResult<u32> {
+    fn autobaud(&self, py: Python<'_>, number: OfDevice, silence: Seconds) -> PyResult<u32> {
         let session = self.session()?;
-        let silence = duration(silence)?;
+        let silence = duration(silence.0)?;
         Ok(py.detach(|| session.find_bitrate(number.0, silence, signals))?)
     }
 
@@ -246,7 +249,7 @@ impl Device {
         py: Python<'_>,
         number: OfDevice,
         frames: Vec<AnyFrame>,
-        timeout: Option<f64>,
+        timeout: Option<Seconds>,
         at_ns: Option<i64>,
         queue_timeout: f64,
         node: SenderId,
@@ -254,7 +257,7 @@ impl Device {
         let channel = number.0;
         let session = self.session()?;
         let frames: Vec<TraceFrame> = frames.into_iter().map(|frame| frame.0).collect();
-        let seconds = timeout.unwrap_or(queue_timeout);
+        let seconds = timeout.map_or(queue_timeout, |timeout| timeout.0);
         let patience = duration(seconds)?;
         if let (Some(_), Some(at_ns)) = (timeout, at_ns) {
             let ahead_s = at_ns.saturating_sub(utc_ns()) as f64 / 1e9;
@@ -322,13 +325,13 @@ impl Device {
 
     /// Starts a periodic frame.
     #[expect(clippy::too_many_arguments, reason = "what Python's half passes, each by its name")]
-    #[pyo3(signature = (number, frame, period_s, count, modifiers, node=NOBODY))]
+    #[pyo3(signature = (number, frame, period, count, modifiers, node=NOBODY))]
     fn periodic(
         &self,
         py: Python<'_>,
         number: OfDevice,
         frame: AnyFrame,
-        period_s: f64,
+        period: Seconds,
         count: Whole<u32>,
         modifiers: Vec<tasks::ModifierWords>,
         node: SenderId,
@@ -336,7 +339,7 @@ impl Device {
         let channel = number.0;
         let session = self.session()?;
         let frame = frame.classic("what a device repeats")?;
-        let begin = || PeriodicFrame::begin(session, channel, frame, period_s, count.0, &modifiers, node);
+        let begin = || PeriodicFrame::begin(session, channel, frame, period.0, count.0, &modifiers, node);
         Ok(py.detach(begin)?)
     }
 
@@ -460,8 +463,14 @@ impl Device {
     }
 
     /// Shows an LED pattern, to find the device among others.
-    fn identify(&self, py: Python<'_>, seconds: Whole<u8>) -> PyResult<()> {
-        self.ask(py, |device| device.identify(seconds.0))
+    fn identify(&self, py: Python<'_>, time: Seconds) -> PyResult<()> {
+        let seconds = time.0.ceil();
+        if !(0.0..=255.0).contains(&seconds) {
+            return Err(
+                Error::argument(format!("{seconds} s is not a time for this: give up to 255 s")).into()
+            );
+        }
+        self.ask(py, |device| device.identify(seconds as u8))
     }
 
     /// Closes the channels and ends the session; records already received can still be read.

@@ -15,6 +15,7 @@ use super::fanout::Listener;
 use super::lock::lock;
 use crate::error::{DeviceError, Error};
 use crate::frame::Record;
+use crate::grammar::Seconds;
 use crate::number::Whole;
 use crate::table::Table;
 
@@ -45,8 +46,8 @@ pub struct Until(Option<Instant>);
 
 impl Until {
     /// From seconds; `None` for ever.
-    pub fn of(timeout: Option<f64>) -> Result<Self, Error> {
-        let Some(seconds) = timeout else { return Ok(Self(None)) };
+    pub fn of(timeout: Option<Seconds>) -> Result<Self, Error> {
+        let Some(Seconds(seconds)) = timeout else { return Ok(Self(None)) };
         // `max` alone would make 0 of what is not a number.
         let time = Duration::try_from_secs_f64(if seconds < 0.0 { 0.0 } else { seconds });
         let time = time.map_err(|_| Error::argument(format!("{seconds} s is not a valid time to wait")))?;
@@ -165,7 +166,7 @@ impl Records {
 
     /// The next record; `None` if there is none within `timeout` seconds, or after the last.
     #[pyo3(signature = (timeout=None))]
-    fn read(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<Record>> {
+    fn read(&self, py: Python<'_>, timeout: Option<Seconds>) -> PyResult<Option<Record>> {
         match self.next(py, Until::of(timeout)?)? {
             Next::One(record) => Ok(Some(Record(record))),
             Next::Nothing | Next::End => Ok(None),
@@ -174,7 +175,7 @@ impl Records {
 
     /// Records of up to `seconds`, at most `rows`, as a table; fewer once the device has been closed.
     #[pyo3(signature = (seconds=None, rows=Whole(65_536)), text_signature = "($self, seconds=None, rows=65536)")]
-    fn batch(&self, py: Python<'_>, seconds: Option<f64>, rows: Whole<usize>) -> PyResult<Table> {
+    fn batch(&self, py: Python<'_>, seconds: Option<Seconds>, rows: Whole<usize>) -> PyResult<Table> {
         let rows = rows.0;
         if rows == 0 {
             return Err(Error::argument("a batch has at least one row").into());
@@ -204,7 +205,7 @@ impl Records {
 
     /// For the plugin: the next records that are at hand, as python-can's messages; empty if there are none within the time.
     /// Until [`Self::_used_up`] they count as waiting.
-    fn _messages<'py>(&self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Vec<Message<'py>>> {
+    fn _messages<'py>(&self, py: Python<'py>, timeout: Option<Seconds>) -> PyResult<Vec<Message<'py>>> {
         let first = match self.next(py, Until::of(timeout)?)? {
             Next::One(record) => record,
             Next::Nothing => return Ok(Vec::new()),

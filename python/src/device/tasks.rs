@@ -16,13 +16,14 @@ use super::session::{Session, SlotTable};
 use super::transmissions::{NOBODY, SenderId};
 use crate::error::Error;
 use crate::frame::{AnyFrame, identifier};
+use crate::grammar::Identifier;
 use crate::number::Whole;
 
 /// A modifier as it comes from Python: its kind, the byte, and two numbers or a name.
 pub type ModifierWords = (String, Whole<u8>, Whole<u8>, Whole<u8>, String);
 
 /// What to reply to: identifier, mask, whether it has 29 bits.
-pub type Match = (Whole<u32>, Option<Whole<u32>>, Option<bool>);
+pub type Match = (Identifier, Option<Identifier>, Option<bool>);
 
 fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Modifier, Error> {
     let byte = byte.0;
@@ -175,9 +176,9 @@ impl Reply {
         reply: Frame,
         count: u32,
     ) -> Result<Self, Error> {
-        let id = identifier(id.0, extended)?;
+        let id = identifier(id.raw, extended.or(id.extended))?;
         let widest = if id.is_extended() { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
-        let mask = mask.map_or(widest, |mask| mask.0);
+        let mask = mask.map_or(widest, |mask| mask.raw);
         if mask > widest {
             return Err(Error::argument(format!(
                 "the mask {mask:#X} has more bits than the identifier, {widest:#X}"

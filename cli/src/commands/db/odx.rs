@@ -7,13 +7,11 @@ use cantap_protocols::odx::{Ecu, Odx};
 use cantap_work::terms::counted;
 use serde_json::{Value, json};
 
-use crate::protocols::read_odx;
-
 /// Lists the content of files, or what is not understood in them.
 pub fn run(files: &[PathBuf], warnings: bool, json: bool, out: &mut impl Write) -> anyhow::Result<()> {
     let mut objects = Vec::new();
     for (at, path) in files.iter().enumerate() {
-        let (odx, name) = (read_odx(path)?, path.display().to_string());
+        let (odx, name) = (cantap_work::odx::read(path)?, path.display().to_string());
         match (warnings, json) {
             (true, false) => write_warnings(&odx, &name, out)?,
             (true, true) => objects.extend(odx.issues.iter().map(|issue| {

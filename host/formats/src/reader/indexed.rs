@@ -36,6 +36,16 @@ impl TraceReader {
         self.passed.latest_ns
     }
 
+    /// How far it has come: bytes, or for what is read at many places something that grows like them.
+    pub(crate) fn position(&self) -> u64 {
+        self.decoder.position().unwrap_or_else(|| self.input.offset())
+    }
+
+    /// Whether the file's bytes are read as they are, in a format that can be read on from places in it.
+    pub(crate) fn can_go_on_from_anywhere(&self) -> bool {
+        self.input.file().is_some() && !self.input.may_wait() && self.decoder.save(&mut Vec::new())
+    }
+
     /// Does something with the index, if there is one, and gives it up if it returns false.
     fn indexed(
         &mut self,

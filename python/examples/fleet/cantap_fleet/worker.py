@@ -81,6 +81,7 @@ class _Workplace:
             "rows": str(rows),
             "stem": None,
             "part": None,
+            "divide": None,
         }
 
     def _local(self, row: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-//! Descriptions of ECUs (ODX), as given.
+//! Descriptions of ECUs (ODX), as users name them.
 
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,9 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use cantap_protocols::odx::{Descriptions, Odx, Source, is_document};
-use cantap_work::terms::counted;
+
+use crate::report::Reporter;
+use crate::terms::counted;
 
 /// The largest file that is looked at, packed or not.
 const MOST_BYTES: u64 = 512 << 20;
@@ -40,6 +42,10 @@ pub fn is_odx(path: &str) -> bool {
 }
 
 /// Reads a file.
+///
+/// # Errors
+///
+/// It cannot be read, is damaged, or is larger than 512 MiB.
 pub fn read(path: &Path) -> anyhow::Result<Odx> {
     let name = path.display();
     let file = std::fs::File::open(path).with_context(|| format!("cannot read {name}"))?;
@@ -53,8 +59,12 @@ pub fn read(path: &Path) -> anyhow::Result<Odx> {
     Odx::read(&short, &bytes).with_context(|| name.to_string())
 }
 
-/// Reads all files. How much of them is not understood is reported on standard error, unless `quiet`.
-pub fn load(paths: &[OdxPath], quiet: bool) -> anyhow::Result<Option<Arc<Descriptions>>> {
+/// Reads all files; `None` if there is none. How much of them is not evaluated is reported.
+///
+/// # Errors
+///
+/// A file cannot be read, is damaged or too large, or does not say which ECU is meant.
+pub fn load(paths: &[OdxPath], reporter: &Reporter) -> anyhow::Result<Option<Arc<Descriptions>>> {
     if paths.is_empty() {
         return Ok(None);
     }
@@ -65,12 +75,12 @@ pub fn load(paths: &[OdxPath], quiet: bool) -> anyhow::Result<Option<Arc<Descrip
         }
         let odx = read(path)?;
         let issues = odx.issues.len() + odx.issues_left_out;
-        if issues > 0 && !quiet {
+        if issues > 0 {
             let name = path.display();
-            eprintln!(
-                "cantap: {name}: {} not evaluated; `cantap db {name} --warnings` lists them",
+            reporter.note(format!(
+                "{name}: {} not evaluated; `cantap db {name} --warnings` lists them",
                 counted(issues, "thing")
-            );
+            ));
         }
         files.push((path, odx));
     }

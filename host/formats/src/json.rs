@@ -15,7 +15,7 @@ use super::row_format::{Line, RowFormat as _};
 use super::table::{self, Columns, TypedColumn, TypedForm};
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
-use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
 use object::{Field, Kind, Next};
 
 const NO_FRAMES: &str = "JSON objects that are no frames";
@@ -232,8 +232,9 @@ fn own_record(fields: &[Field], frame: TraceFrame, zone: &Zone) -> Result<TraceR
     let channel = text::decimal(value("channel")).unwrap_or(1);
     let channel =
         u8::try_from(channel).map_err(|_| Fault::malformed("a channel of 0 to 255", value("channel")))?;
+    let device_ns = text::decimal(value("device_ns")).and_then(DeviceNs::new);
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
-    Ok(TraceRecord { time_ns, channel, event })
+    Ok(TraceRecord { time_ns, device_ns, channel, event })
 }
 
 impl Decode for Decoder {

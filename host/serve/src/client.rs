@@ -102,7 +102,7 @@ impl Client {
             let mut goes_on = !is_stranger(&first, &inbox);
             // What waits in one piece can take long: for as long as it does not read its answers.
             inbox.push(bytes, |incoming| {
-                goes_on = goes_on && self.may_stay(&checked_at) && self.take(incoming)
+                goes_on = goes_on && self.may_stay(&checked_at) && self.take(incoming);
             });
             if !self.has_greeted() && !first.is_empty() && (!goes_on || is_stranger(&first, &inbox)) {
                 self.let_go(foreign::reason(&first));

@@ -324,13 +324,12 @@ impl Reader {
             }
             for (at, mux) in muxes.into_iter().enumerate() {
                 let Some(Mux::For(values)) = mux else { continue };
-                match switch.filter(|switch| *switch != at) {
-                    Some(switch) => message.signals[at].multiplexed = Some(Multiplexed { switch, values }),
-                    None => {
-                        let symbol = format!("{}.{}", message.name, message.signals[at].name);
-                        let kind = FaultKind::NoMultiplexer(String::new());
-                        self.faults.push(Fault { line: message.signals[at].line, symbol, kind });
-                    }
+                if let Some(switch) = switch.filter(|switch| *switch != at) {
+                    message.signals[at].multiplexed = Some(Multiplexed { switch, values });
+                } else {
+                    let symbol = format!("{}.{}", message.name, message.signals[at].name);
+                    let kind = FaultKind::NoMultiplexer(String::new());
+                    self.faults.push(Fault { line: message.signals[at].line, symbol, kind });
                 }
             }
             let needed = message.signals.iter().map(Signal::bytes_needed).max().unwrap_or(0);
@@ -433,13 +432,10 @@ fn length(cell: &str) -> Option<u16> {
 
 /// How the bits are to be interpreted, if the table does not say it: as what its smallest value needs.
 fn value_kind(kind: Option<ValueKind>, signal: &Signal) -> ValueKind {
-    match kind {
-        Some(kind) => kind,
-        None => {
-            let lowest = signal.min.map(|min| (min - signal.offset) / signal.factor);
-            if lowest.is_some_and(|raw| raw < -0.5) { ValueKind::Signed } else { ValueKind::Unsigned }
-        }
-    }
+    kind.unwrap_or_else(|| {
+        let lowest = signal.min.map(|min| (min - signal.offset) / signal.factor);
+        if lowest.is_some_and(|raw| raw < -0.5) { ValueKind::Signed } else { ValueKind::Unsigned }
+    })
 }
 
 #[cfg(test)]

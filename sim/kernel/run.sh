@@ -1,6 +1,6 @@
 #!/bin/bash
 # run.sh CACHE CANTAP SIM ELF [PART...]: CACHE is prepare.sh's; the `cantap` and `cantap-sim` commands; the firmware. Exit code 0 only if
-# every check holds.
+# every check holds. The part `foreign` is for other firmware than ours, which ELF is then.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 cache=$1 cantap=$2 sim=$3 elf=$4
@@ -21,7 +21,10 @@ cp -r "$here/guest" "$share"
 cp "$cantap" "$share/cantap"
 echo "PARTS='$*'" > "$share/settings"
 
-"$sim" usbip "$elf" "$share" 2> "$work/server.err" &
+any=
+[ "$*" != foreign ] || any=--any
+# shellcheck disable=SC2086 # none, or one word
+"$sim" usbip $any "$elf" "$share" 2> "$work/server.err" &
 server=$!
 for _ in $(seq 600); do
   [ ! -s "$share/ports" ] || break

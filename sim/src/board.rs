@@ -1,6 +1,10 @@
 //! What the emulator must know about our boards and the firmware: clock, crystal, and the interrupts that capture.
 
-use cantap_emu::{Clock, Image, Setup};
+use std::sync::{Arc, Mutex};
+
+use cantap_emu::usb::UsbPort;
+use cantap_emu::usb_host::Timing;
+use cantap_emu::{Clock, Image, Machine, Setup, memory_map as map};
 use cantap_wire::RECEIVE_PINS_SYMBOL;
 
 /// The firmware's SYSCLK, which is the core's clock.
@@ -24,4 +28,17 @@ pub fn setup_for(image: &Image) -> Setup {
             [(usize::from(*port_1), u32::from(*pin_1)), (usize::from(*port_2), u32::from(*pin_2))];
     }
     setup
+}
+
+/// How long a program may take to set up its clocks, in ms: a crystal and the PLL start in less than 3.
+const CLOCKS_WITHIN_MS: u64 = 50;
+
+/// The core's clock as any program for the chip sets it up, which has to be known before a machine's time has a unit: found out by running
+/// it. `None` if that is not a multiple of 12 MHz, or the program ends before.
+pub fn clock_of(image: &Image) -> Option<Clock> {
+    let mut machine = Machine::new(image.clone(), setup());
+    machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::new(Mutex::new(UsbPort::new(Timing::new(CLOCK)))));
+    machine.run_until(CLOCK.ms(CLOCKS_WITHIN_MS)).ok()?;
+    let hz = machine.board().clocks().hclk_hz;
+    Clock::checked(hz)
 }

@@ -13,7 +13,7 @@ use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, parse_log};
 use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_SECOND;
-use cantap_sim::board::CLOCK;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::firmware::{self, FirmwareError};
 use cantap_sim::hostile;
 use cantap_sim::run::{self, Load, Options, Report};
@@ -70,6 +70,9 @@ struct SoakArgs {
 struct UsbipArgs {
     /// The firmware's ELF, as `cargo xtask firmware` makes it.
     firmware: PathBuf,
+    /// Take any program for the chip, such as other firmware for a USB adapter.
+    #[arg(long)]
+    any: bool,
     /// Where the ports are written, and whatever a line asks to be written.
     folder: PathBuf,
 }
@@ -202,7 +205,17 @@ fn open(firmware: &Path) -> anyhow::Result<Image> {
 }
 
 fn usbip(args: &UsbipArgs) -> anyhow::Result<ExitCode> {
-    cantap_sim::usbip::serve(open(&args.firmware)?, &args.folder)?;
+    let (image, clock) = if args.any {
+        let name = args.firmware.display();
+        let bytes = std::fs::read(&args.firmware).with_context(|| format!("{name} cannot be read"))?;
+        let image = Image::program(&bytes).with_context(|| name.to_string())?;
+        let clock = board::clock_of(&image);
+        let clock = clock.with_context(|| format!("{name} sets up no clock that is a multiple of 12 MHz"))?;
+        (image, clock)
+    } else {
+        (open(&args.firmware)?, CLOCK)
+    };
+    cantap_sim::usbip::serve(image, clock, &args.folder)?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -119,7 +119,7 @@ impl Gvret {
                 let Some(channel) = Channel::from_number(bus + 1) else {
                     return self.oddities.count("frames of a third or higher bus");
                 };
-                let at = self.clock.place(stamp_us.into(), arrival);
+                let at = self.clock.place(stamp_us.into(), arrival, &mut self.oddities);
                 self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
             }
             Message::Fd { stamp_us, bus, frame } => self.take_fd(stamp_us, bus, frame, arrival),
@@ -160,7 +160,7 @@ impl Gvret {
             let (stage, at) = (LossStage::Link, At::arrival(arrival));
             return self.backlog.push(Incoming::Lost { channel, stage, count: 1, at_least: false, at });
         };
-        let at = self.clock.place(stamp_us.into(), arrival);
+        let at = self.clock.place(stamp_us.into(), arrival, &mut self.oddities);
         self.backlog.push(Incoming::Received { channel, frame: frame.into(), at });
     }
 

@@ -115,7 +115,7 @@ impl Kvaser {
     }
 
     fn take(&mut self, message: &KvaserMessage, arrival: Instant) {
-        let at = self.clock.place(message.stamp_us.into(), arrival);
+        let at = self.clock.place(message.stamp_us.into(), arrival, &mut self.channel.oddities);
         // The message is the first after a loss.
         self.channel.losses_before(message.flags, LOSSES, at);
         if message.flags & flag::ERROR_FRAME != 0 {

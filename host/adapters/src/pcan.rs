@@ -140,7 +140,7 @@ impl Pcan {
     }
 
     fn take(&mut self, message: &PcanMessage, stamp_us: u64, arrival: Instant) {
-        let at = self.clock.place(stamp_us, arrival);
+        let at = self.clock.place(stamp_us, arrival, &mut self.channel.oddities);
         if message.kind & kind::STATUS != 0 {
             let [a, b, c, d, ..] = message.data;
             let status = Status(u32::from_be_bytes([a, b, c, d]));

@@ -29,6 +29,8 @@ pub enum Losses {
     NotReported,
     /// The adapter, as flags: at least one frame each time.
     Flags,
+    /// Some adapters, as flags; others do not notice any, and which one this is cannot be told.
+    MayFlag,
     /// Nobody; but the adapter reports when its buffer was full and it stopped listening.
     Stops,
     /// The kernel exactly, and the controller's driver as far as it notices.
@@ -42,7 +44,7 @@ impl Losses {
     pub const fn are_counted(self) -> bool {
         match self {
             Self::Flags | Self::Kernel => true,
-            Self::NotReported | Self::Stops | Self::Trace => false,
+            Self::NotReported | Self::MayFlag | Self::Stops | Self::Trace => false,
         }
     }
 }
@@ -102,7 +104,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 28] = [
+pub const ROWS: [Row; 31] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -204,6 +206,7 @@ pub const ROWS: [Row; 28] = [
     interface("socketcan-hw", Stamps::Controller, Confirmation::OnTheBus, false),
     interface("socketcan-hw-silent", Stamps::Controller, Confirmation::CannotSend, true),
     interface("socketcan-no-echo", Stamps::Kernel, Confirmation::Accepted, false),
+    interface("socketcan-hw-no-echo", Stamps::Controller, Confirmation::Accepted, false),
     Row {
         what: "a CAN interface of Linux without a bit rate, such as a virtual one",
         errors: "those that other programs write",
@@ -214,6 +217,8 @@ pub const ROWS: [Row; 28] = [
     gs_usb("gs_usb-normal", true, false),
     gs_usb("gs_usb-arrival", false, true),
     gs_usb("gs_usb-arrival-normal", false, false),
+    cannectivity("gs_usb-confirmed", true),
+    cannectivity("gs_usb-arrival-confirmed", false),
     elm327("elm327", true, Some(NO_LENGTHS)),
     elm327("elm327-normal", false, Some(NO_LENGTHS)),
     elm327("elm327-standard", true, Some(STANDARD_ONLY)),
@@ -261,19 +266,29 @@ const fn elm327(board: &'static str, can_listen: bool, limits: Option<&'static s
     }
 }
 
-/// A row of gs_usb adapters.
+/// A row of gs_usb adapters. candleLight's firmware, the most common, returns a sent frame when its controller has it, and notices no frame that
+/// its controller or it had no room for (`CAN_SendFrame`, `can_receive`); which firmware it is cannot be told.
 const fn gs_usb(board: &'static str, has_stamps: bool, can_listen: bool) -> Row {
     const CLOCK: Stamps = Stamps::Adapter { grain_ns: 1_000, when: "its firmware's taking the frame" };
     Row {
         board,
         what: if can_listen { "a gs_usb adapter" } else { "a gs_usb adapter that cannot only listen" },
         stamps: if has_stamps { CLOCK } else { Stamps::Arrival },
-        losses: Losses::Flags,
+        losses: Losses::MayFlag,
         errors: "states, and each error if the adapter reports it",
-        confirmation: Confirmation::OnTheBus,
+        confirmation: Confirmation::Accepted,
         listen_only: if can_listen { ListenOnly::Unconfirmed } else { ListenOnly::Never },
         sets_bit_rate: true,
         limits: None,
+    }
+}
+
+/// A row of adapters with CANnectivity, which returns a frame once it was sent (`gs_usb_can_tx_callback`), known by its own product number.
+const fn cannectivity(board: &'static str, has_stamps: bool) -> Row {
+    Row {
+        what: "a gs_usb adapter with CANnectivity",
+        confirmation: Confirmation::OnTheBus,
+        ..gs_usb(board, has_stamps, true)
     }
 }
 
@@ -304,6 +319,9 @@ impl Row {
             Losses::NotReported => "losses before this program: not reported by this adapter",
             Losses::Flags => {
                 "losses before this program: the adapter reports that there were some, not how many"
+            }
+            Losses::MayFlag => {
+                "losses before this program: some adapters of this kind report that there were some, others (candleLight's firmware) none"
             }
             Losses::Stops => {
                 "losses before this program: the adapter reports when its buffer was full, not how many frames that cost, and nothing of others"

@@ -126,10 +126,16 @@ impl Slcan {
             let digits = |range: std::ops::Range<usize>| number(text.get(range).unwrap_or_default());
             self.version = [digits(1..3), digits(3..5), 0];
         }
-        if let Some(Text::Line(text)) = self.ask(b"N\r")?
-            && let Some(serial) = text.strip_prefix(b"N")
-        {
-            self.serial = String::from_utf8_lossy(serial).into_owned();
+        match self.ask(b"N\r")? {
+            Some(Text::Line(text)) if text.starts_with(b"V") => {
+                // Everything would be taken for the answer to what is asked next, a refusal to be silent for none.
+                return Err("its answers come twice".to_owned());
+            }
+            Some(Text::Line(text)) => {
+                let serial = text.strip_prefix(b"N").unwrap_or_default();
+                self.serial = String::from_utf8_lossy(serial).into_owned();
+            }
+            _ => {}
         }
         // Listening disturbs nobody, whatever the bit rate.
         let set = self.ask(b"S6\r")?;
@@ -144,6 +150,8 @@ impl Slcan {
     /// Sends a command and returns the first line that is no frame, if one comes in time.
     fn ask(&mut self, command: &[u8]) -> Result<Option<Text>, String> {
         self.line.write(command);
+        // Else it has a letter of its own, or answers a question that was put before.
+        let asks = matches!(command.first(), Some(b'V' | b'N'));
         let deadline = Instant::now() + ANSWER_WITHIN;
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
@@ -156,8 +164,12 @@ impl Slcan {
             self.splitter.push(&piece.content, |text| lines.push(text));
             let mut answer = None;
             for text in lines {
-                let is_report = matches!(&text, Text::Line(line) if matches!(line.first(), Some(b't' | b'T' | b'r' | b'R' | b'e' | b's')));
-                if answer.is_none() && !is_report {
+                let is_other = matches!(&text, Text::Line(line) if match line.first() {
+                    Some(b't' | b'T' | b'r' | b'R' | b'e' | b's') => true,
+                    Some(b'V' | b'N' | b'F' | b'z' | b'Z') => !asks,
+                    _ => false,
+                });
+                if answer.is_none() && !is_other {
                     answer = Some(text);
                 } else {
                     self.take(text, piece.at);
@@ -226,6 +238,8 @@ impl Slcan {
         if let Some(InFlight { mailbox, again: None, .. }) = self.in_flight {
             self.in_flight = None;
             self.backlog.push(Incoming::Sent { channel: Channel::Can1, mailbox, at });
+        } else {
+            self.oddities.count("answers to nothing");
         }
     }
 
@@ -255,8 +269,8 @@ impl Slcan {
         }
         let at = match stamp.len() {
             0 => At::arrival(arrival),
-            4 => self.ms_clock.place(u64::from(hex(stamp)?), arrival),
-            8 => self.us_clock.place(u64::from(hex(stamp)?), arrival),
+            4 => self.ms_clock.place(u64::from(hex(stamp)?), arrival, &mut self.oddities),
+            8 => self.us_clock.place(u64::from(hex(stamp)?), arrival, &mut self.oddities),
             _ => return None,
         };
         // A millisecond tells less than the arrival, but no more than it knows is claimed: it is an upper bound either way.

@@ -27,6 +27,8 @@ pub(crate) struct Socketcand {
     line: Line,
     /// The message that is arriving, from its `<` on.
     partial: Vec<u8>,
+    /// What arrives is outside of messages, and is counted.
+    is_outside: bool,
     interface: String,
     clock: AdapterClock,
     backlog: Vec<Incoming>,
@@ -43,6 +45,7 @@ impl Socketcand {
         let mut server = Self {
             line,
             partial: Vec::new(),
+            is_outside: false,
             interface: interface.to_owned(),
             // Microseconds of the server's clock, which never start again.
             clock: AdapterClock::new(1_000, 1 << 53),
@@ -94,15 +97,28 @@ impl Socketcand {
         let mut messages = Vec::new();
         for &byte in bytes {
             match byte {
-                b'<' if self.partial.is_empty() => self.partial.push(byte),
+                b'<' => {
+                    // One that has no end: the next begins.
+                    if !self.partial.is_empty() {
+                        self.damaged("messages without an end", arrival);
+                    }
+                    self.is_outside = false;
+                    self.partial = vec![byte];
+                }
                 b'>' if !self.partial.is_empty() => {
                     let text = String::from_utf8_lossy(&self.partial[1..]).trim().to_owned();
                     self.partial.clear();
                     messages.push(text);
                 }
-                _ if self.partial.is_empty() => {}
+                _ if self.partial.is_empty() => {
+                    if !self.is_outside && !byte.is_ascii_whitespace() {
+                        self.is_outside = true;
+                        self.damaged("bytes outside of messages", arrival);
+                    }
+                }
                 _ if self.partial.len() == MAX_MESSAGE => {
                     self.partial.clear();
+                    self.is_outside = true;
                     self.damaged("messages longer than any", arrival);
                 }
                 _ => self.partial.push(byte),
@@ -122,7 +138,7 @@ impl Socketcand {
         match fields.next() {
             Some(kind @ ("frame" | "rtr")) => match frame(fields, kind == "rtr") {
                 Some((frame, time_us)) => {
-                    let at = self.clock.place(time_us, arrival);
+                    let at = self.clock.place(time_us, arrival, &mut self.oddities);
                     self.backlog.push(Incoming::Received { channel: Channel::Can1, frame: frame.into(), at });
                 }
                 None => self.damaged("frames that cannot be read", arrival),

@@ -1,7 +1,8 @@
 //! GVRET: the binary protocol of ESP32RET, M2RET and Macchina's boards, on a serial port or TCP port 23.
 //!
 //! As ESP32RET reads and writes it (`src/gvret_comm.h`, `src/commbuffer.h`), and SavvyCAN at the other end (`connections/gvretserial.cpp`).
-//! It knows neither remote frames nor errors nor losses. Nothing in it is a check: the byte for a checksum is 0, and nobody looks at it.
+//! It knows neither remote frames nor errors nor losses. The byte for a checksum is 0 (ESP32RET, M2RET, GVRET), and clients
+//! do not look at it; here a frame with another byte there is none, since bytes before it were lost.
 
 use cantap_can::{FdFrame, Frame, Id};
 
@@ -158,7 +159,9 @@ pub fn message(bytes: &[u8]) -> Option<(Message, usize)> {
             // A length that no frame has, or an impossible identifier: the start was data.
             let Some(id) = id_of(raw).filter(|_| len <= 8) else { return Some((Message::Garbage, 1)) };
             let data = content.get(9..9 + len)?;
-            content.get(9 + len)?;
+            if !is_end(bytes, 2 + 9 + len)? {
+                return Some((Message::Garbage, 1));
+            }
             let frame = Frame::data_frame(id, data)?;
             (Message::Frame { stamp_us, bus, frame }, 2 + 9 + len + 1)
         }
@@ -169,7 +172,9 @@ pub fn message(bytes: &[u8]) -> Option<(Message, usize)> {
                 return Some((Message::Garbage, 1));
             }
             let data = content.get(10..10 + len)?;
-            content.get(10 + len)?;
+            if !is_end(bytes, 2 + 10 + len)? {
+                return Some((Message::Garbage, 1));
+            }
             let frame = id_of(raw).and_then(|id| FdFrame::new(id, false, false, data));
             (Message::Fd { stamp_us, bus, frame }, 2 + 10 + len + 1)
         }
@@ -199,6 +204,20 @@ pub fn message(bytes: &[u8]) -> Option<(Message, usize)> {
         }
         _ => (Message::Garbage, 1),
     })
+}
+
+/// Whether the byte at `at` ends a frame: 0, or what the firmware's own `checksumCalc`, which it does not use, would make of the bytes before it. If
+/// another message may have begun in between, one begins after it, too, or nothing is there yet: otherwise this is the beginning of one and the
+/// end of another.
+fn is_end(bytes: &[u8], at: usize) -> Option<bool> {
+    let (before, after) = bytes.split_at_checked(at)?;
+    let last = *after.first()?;
+    let has_start = before.iter().skip(1).any(|byte| *byte == START);
+    let goes_on_otherwise = after.get(1).is_some_and(|byte| *byte != START);
+    Some(
+        (last == 0 || last == before.iter().fold(0, |sum, byte| sum ^ byte))
+            && !(has_start && goes_on_otherwise),
+    )
 }
 
 impl Message {

@@ -3,7 +3,7 @@
 
 use std::ops::Add;
 
-use cantap_wire::message::{EndReason, Status};
+use cantap_wire::message::{EndReason, Status, capability};
 use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Reply, Response, TransmittedFd};
 
@@ -257,6 +257,9 @@ impl Intake {
                     *counters = Counters::default();
                     *off_bus_since = [None; CHANNELS];
                     *lengths = BitLengths::default();
+                    if answer.capabilities & capability::ADAPTER != 0 {
+                        lengths.leave_out_sent();
+                    }
                     *last_ns = i64::MIN;
                     *clock = ClockMap::new(answer.tick_hz, now);
                 }

@@ -8,7 +8,7 @@ use cantap_trace::BusBits;
 use cantap_wire::CHANNELS;
 
 use super::clock::Ticks;
-use crate::TraceEvent;
+use crate::{Direction, TraceEvent};
 
 /// A record as it came from the device, by the device's own clock.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,6 +28,8 @@ pub struct BitLengths {
     fixed: [u64; CHANNELS],
     /// The same for the bits of CAN FD's data phases; 0 if it is not known.
     fixed_data: [u64; CHANNELS],
+    /// Sent frames are stamped when the device accepts them, which may be long before they are on the bus.
+    sent_are_early: bool,
 }
 
 /// Fractional bits of a bit's length in ticks.
@@ -51,6 +53,11 @@ impl BitLengths {
         self.fixed_data[channel] = bitrate_bps.map_or(0, of);
     }
 
+    /// Leaves sent frames out: their stamps are not those of the bus, and bound no others.
+    pub fn leave_out_sent(&mut self) {
+        self.sent_are_early = true;
+    }
+
     /// How long a frame takes, in ticks, if that is known.
     #[inline]
     fn ticks(&self, channel: usize, bits: BusBits) -> Option<i64> {
@@ -68,9 +75,9 @@ impl BitLengths {
 pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
     let mut limits = [None; CHANNELS];
     for record in records.iter_mut().rev() {
-        let TraceEvent::Frame { frame, .. } = &record.event else { continue };
+        let TraceEvent::Frame { frame, direction, .. } = &record.event else { continue };
         let channel = usize::from(record.channel == 2);
-        if lengths.fixed[channel] == 0 {
+        if lengths.fixed[channel] == 0 || lengths.sent_are_early && *direction == Direction::Tx {
             continue;
         }
         let limit = limits[channel].filter(|limit| record.at.since(*limit) > 0);
@@ -82,7 +89,6 @@ pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Direction;
 
     fn record(channel: u8, ticks: u64, late: bool) -> Stamped {
         let frame = "000#55".parse().unwrap();
@@ -135,6 +141,21 @@ mod tests {
         assert_eq!(times(&lengths, switched), [second - length, second, 100_000]);
         lengths.set_data(0, None, 12_000_000);
         assert_eq!(times(&lengths, switched), [100_000, second, 100_000]);
+    }
+
+    /// Another maker's adapter says when it accepted a frame. What was received just before was not on the bus earlier for that.
+    #[test]
+    fn a_sent_frame_that_is_stamped_before_it_is_on_the_bus_bounds_nothing() {
+        let mut lengths = BitLengths::default();
+        lengths.set(0, 36, 36_000_000, 12_000_000);
+        lengths.leave_out_sent();
+        let mut sent = record(1, 10_100, false);
+        let TraceEvent::Frame { direction, .. } = &mut sent.event else { panic!() };
+        *direction = Direction::Tx;
+        let mut records = vec![record(1, 10_000, false), sent, record(1, 10_650, false)];
+        tighten(&mut records, &lengths);
+        let times: Vec<u64> = records.iter().map(|record| record.at.0).collect();
+        assert_eq!(times, [9954, 10_100, 10_650], "58 bits of 12 ticks before the next that was received");
     }
 
     #[test]

@@ -13,8 +13,12 @@ impl Clock {
     /// # Panics
     /// If it is not.
     pub const fn new(hz: u64) -> Self {
-        assert!(hz > 0 && hz.is_multiple_of(12_000_000));
-        Self { hz }
+        Self::checked(hz).expect("a multiple of 12 MHz")
+    }
+
+    /// The same; `None` if it is none that this unit can be.
+    pub const fn checked(hz: u64) -> Option<Self> {
+        if hz > 0 && hz.is_multiple_of(12_000_000) { Some(Self { hz }) } else { None }
     }
 
     /// Cycles in a second.

@@ -1,5 +1,6 @@
 #!/usr/bin/perl
-# gs_usb.pl PORT FOLDER: a gs_usb adapter with two channels on one bus, exported by USB/IP, as candleLight's firmware behaves (`src/usbd_gs_can.c`).
+# gs_usb.pl PORT FOLDER: a gs_usb adapter with two channels on one bus, exported by USB/IP, with candleLight's
+# requests (`src/usbd_gs_can.c`). Frames that were sent come back once somebody acknowledged them, as CANnectivity's do; candleLight's come back at once.
 #
 # FOLDER/traffic: a number of frames, which every started channel then receives; they are appended to FOLDER/sent once all are on their way.
 # FOLDER/error: the eight digits of an error frame's classes and its data, for the first channel.

@@ -3,17 +3,17 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::board::{self, CLOCK};
+use crate::board;
 use cantap_wire::{CHANNELS, Frame};
 
 use super::error::Error;
 use super::exported::Exported;
 use super::urbs::Urbs;
-use crate::rig::MS;
 use crate::run::DEFAULT_BITRATE_BPS;
+use cantap_emu::Clock;
 use cantap_emu::bus::{BitTime, BusFrame, Member, Node, Source};
 use cantap_emu::elf::Image;
-use cantap_emu::machine::Machine;
+use cantap_emu::machine::{Machine, Setup};
 use cantap_emu::memory_map as map;
 use cantap_emu::otg::Otg;
 use cantap_emu::traffic::{Kind, Traffic};
@@ -85,6 +85,7 @@ pub struct Figures {
 /// The board.
 pub struct Board {
     machine: Machine,
+    clock: Clock,
     port: Arc<Mutex<UsbPort<Urbs>>>,
     load: BusLoad,
     seed: u64,
@@ -99,16 +100,16 @@ pub struct Board {
 }
 
 impl Board {
-    /// A board with `image`, and the cable out.
-    pub fn new(image: Image) -> Self {
-        let setup = board::setup_for(&image);
+    /// A board with `image`, which sets up `clock` for the core, and the cable out.
+    pub fn new(image: Image, clock: Clock) -> Self {
+        let setup = Setup { clock, ..board::setup_for(&image) };
         let mut machine = Machine::new(image, setup);
-        let timing = Timing { recovery: Timing::new(CLOCK).recovery, ..Timing::hasty(CLOCK) };
+        let timing = Timing { recovery: Timing::new(clock).recovery, ..Timing::hasty(clock) };
         let port = Arc::new(Mutex::new(UsbPort::with_driver(timing, Urbs::new())));
         machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::clone(&port) as _);
         for wire in &mut machine.board().wires {
-            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK)));
-            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK)));
+            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, clock)));
+            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, clock)));
         }
         let nothing = Figures {
             at: Instant::now(),
@@ -123,6 +124,7 @@ impl Board {
         };
         Self {
             machine,
+            clock,
             port,
             load: BusLoad { percent: 0.0, kind: Kind::Mix, bitrate_bps: None },
             seed: 1,
@@ -139,6 +141,11 @@ impl Board {
     /// The machine.
     pub fn machine(&self) -> &Machine {
         &self.machine
+    }
+
+    /// How long a core cycle is.
+    pub const fn clock(&self) -> Clock {
+        self.clock
     }
 
     /// Runs `action` on the host at the far end of the cable, at the present time.
@@ -199,7 +206,7 @@ impl Board {
             let BusLoad { percent, kind, bitrate_bps } = self.load;
             let time = match (bitrate_bps, bit) {
                 (None, Some(cycles)) => BitTime::of_cycles(cycles),
-                (rate, _) => BitTime::of_rate(rate.unwrap_or(DEFAULT_BITRATE_BPS), CLOCK),
+                (rate, _) => BitTime::of_rate(rate.unwrap_or(DEFAULT_BITRATE_BPS), self.clock),
             };
             let traffic = bit.map(|_| Traffic::new(kind, self.seed + n as u64, percent, now, u64::MAX));
             let source = traffic.map(|traffic| Box::new(traffic) as Box<dyn Source>);
@@ -218,7 +225,7 @@ impl Board {
     pub fn play(&mut self, n: usize, load: BusLoad, count: u64) {
         self.seed += SEEDS;
         let traffic = Traffic::new(load.kind, self.seed, load.percent, self.machine.now(), u64::MAX);
-        let time = self.open[n].map_or(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK), BitTime::of_cycles);
+        let time = self.open[n].map_or(BitTime::of_rate(DEFAULT_BITRATE_BPS, self.clock), BitTime::of_cycles);
         let source = Box::new(First(traffic, count));
         self.machine.board().wires[n].node(TRAFFIC).restart(time, Some(source));
     }
@@ -283,7 +290,7 @@ impl Board {
             if !goes_on(self) {
                 return Ok(true);
             }
-            self.run(MS)?;
+            self.run(self.clock.ms(1))?;
         }
         Ok(false)
     }
@@ -317,7 +324,7 @@ impl Board {
             answers.is_none()
         })?;
         self.unplug();
-        self.run(10 * MS)?;
+        self.run(self.clock.ms(10))?;
         let Some([_, Outcome::Done(device), Outcome::Done(configuration)]) = answers.as_deref() else {
             return Err(Error::NoDevice);
         };

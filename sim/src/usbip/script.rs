@@ -8,7 +8,6 @@ use cantap_wire::{CHANNELS, Frame};
 use serde_json::json;
 
 use super::board::{Board, BusLoad, Crossed};
-use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::traffic::Kind;
 use cantap_emu::usb_host::Request;
 
@@ -101,13 +100,13 @@ fn index(channel: &str) -> Result<usize, String> {
 fn dump(board: &Board, folder: &Path, name: &str) -> Result<(), String> {
     for n in 0..CHANNELS {
         let (taken, sent) = board.books(n);
-        let lines = |frames: &[Crossed], line: fn(&Crossed) -> String| {
+        let lines = |frames: &[Crossed], line: &dyn Fn(&Crossed) -> String| {
             frames.iter().fold(String::new(), |lines, crossed| lines + &line(crossed) + "\n")
         };
         let frame = |crossed: &Crossed| crossed.frame.to_string();
-        let stamp = |crossed: &Crossed| (crossed.valid * 1000 / CYCLES_PER_US).to_string();
+        let stamp = |crossed: &Crossed| (crossed.valid * 1000 / board.clock().us(1)).to_string();
         for (what, lines) in
-            [("taken", lines(taken, frame)), ("stamps", lines(taken, stamp)), ("sent", lines(sent, frame))]
+            [("taken", lines(taken, &frame)), ("stamps", lines(taken, &stamp)), ("sent", lines(sent, &frame))]
         {
             let path = folder.join(format!("{name}.{what}{}", n + 1));
             fs::write(&path, lines).map_err(|error| format!("{}: {error}", path.display()))?;
@@ -127,7 +126,7 @@ pub fn figures(board: &Board) -> String {
     };
     json!({
         "wall_s": (now.at - from.at).as_secs_f64(),
-        "emulated_s": count(|f| f.cycles) as f64 / CYCLES_PER_SECOND as f64,
+        "emulated_s": count(|f| f.cycles) as f64 / board.clock().hz() as f64,
         "computing_s": now.computing.as_secs_f64() - from.computing.as_secs_f64(),
         "starving_s": now.starving.as_secs_f64() - from.starving.as_secs_f64(),
         "taken": taken,

@@ -16,12 +16,11 @@ use super::redir::{Action, Packet, Redir};
 use super::script::{self, ServerAction};
 use super::urb::Urb;
 use super::urbs::Urbs;
-use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+use cantap_emu::Clock;
 use cantap_emu::elf::Image;
 
 /// How long the machine runs between two checks of the sockets.
-const SLICE: u64 = 100 * CYCLES_PER_US;
-const SLICE_WALL: Duration = Duration::from_nanos(SLICE * 1_000_000_000 / CYCLES_PER_SECOND);
+const SLICE: Duration = Duration::from_micros(100);
 /// How long to wait before checking a kernel that owes reads again.
 const STARVED_WAIT: Duration = Duration::from_millis(20);
 /// If emulated time is ahead of the wall clock by less, a wait is not worth it.
@@ -54,10 +53,10 @@ struct Kernel {
     redir: Option<Redir>,
 }
 
-/// Serves the board to kernels on this computer, one at a time, until a line says `quit`. The ports are written to
+/// Serves the board to kernels on this computer, one at a time, until a line says `quit`. The program sets up `clock` for the core. The ports are written to
 /// `folder/ports`, as variables of a shell: USBIP for `usbip attach`, REDIR for QEMU's `usb-redir`, CONTROL for lines.
-pub fn serve(image: Image, folder: &Path) -> Result<(), Error> {
-    let mut board = Board::new(image);
+pub fn serve(image: Image, clock: Clock, folder: &Path) -> Result<(), Error> {
+    let mut board = Board::new(image, clock);
     let exported = Arc::new(board.look()?);
     let usbip = TcpListener::bind("127.0.0.1:0")?;
     let (redir, control) = (TcpListener::bind("127.0.0.1:0")?, TcpListener::bind("127.0.0.1:0")?);
@@ -189,13 +188,13 @@ impl Server {
                 due = Instant::now();
                 continue;
             }
-            self.board.run(SLICE)?;
+            self.board.run(self.board.clock().us(SLICE.as_micros() as u64))?;
             self.deliver();
             if self.kernel.is_some() && !self.board.with_urbs(|urbs| urbs.is_present()) {
                 // The device removed its pull-up: a reset, or the bootloader.
                 self.cut();
             }
-            due += SLICE_WALL;
+            due += SLICE;
             let now = Instant::now();
             match due.checked_duration_since(now) {
                 Some(ahead) if ahead > LEAST_WAIT && !self.wait(events, ahead)? => return Ok(()),

@@ -4,12 +4,16 @@
 
 use crate::common;
 
-use std::io::{BufRead, BufReader, Read, Write};
+use std::io::{BufRead, BufReader, Write};
 use std::net::TcpStream;
 use std::process::{Child, Command};
 use std::time::{Duration, Instant};
 
+use cantap_testing::usbip;
 use serde_json::Value;
+
+/// Far longer than anything takes.
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// The server, and its ports.
 struct Server {
@@ -49,31 +53,19 @@ impl Server {
     }
 
     /// Like `usbip attach`: asks for the device by its bus ID.
-    fn import(&self, name: &[u8]) -> Kernel {
-        let mut stream = TcpStream::connect(("127.0.0.1", self.usbip)).unwrap();
-        stream.set_read_timeout(Some(Duration::from_mins(1))).unwrap();
-        let mut opening = vec![1, 0x11, 0x80, 3, 0, 0, 0, 0];
-        opening.extend(name);
-        opening.resize(40, 0);
-        stream.write_all(&opening).unwrap();
-        Kernel { stream, seq: 0, input: 0, output: 0 }
+    fn import(&self, name: &str) -> usbip::Kernel {
+        usbip::Kernel::import(self.usbip, name).unwrap()
     }
 
     /// Attached, enumerated and configured, as Linux does it.
     fn attach(&self) -> Kernel {
-        let mut kernel = self.import(b"1-1");
-        let reply = kernel.read(320);
+        let mut kernel = self.import("1-1");
+        let reply = kernel.bytes(320);
         assert_eq!(reply[..8], [1, 0x11, 0, 3, 0, 0, 0, 0]);
         assert_eq!(reply[8 + 300..8 + 304], [0x12, 0x09, 0, 1], "vendor and product");
-        let (status, device) = kernel.control([0x80, 6, 0, 1, 0, 0, 64, 0], &[]);
-        // One packet: Linux wants to know its size.
-        assert!(status == 0 && device.len() >= 8, "{device:02x?}");
-        let (_, whole) = kernel.control([0x80, 6, 0, 1, 0, 0, 18, 0], &[]);
-        assert!(whole.len() == 18 && whole.starts_with(&device), "{whole:02x?}");
-        let (_, configuration) = kernel.control([0x80, 6, 0, 2, 0, 0, 255, 0], &[]);
-        (kernel.input, kernel.output) = (bulk(&configuration, 0x80), bulk(&configuration, 0));
-        assert_eq!(kernel.control([0, 9, 1, 0, 0, 0, 0, 0], &[]), (0, vec![]));
-        kernel
+        let configuration = kernel.enumerate();
+        let (input, output) = (usbip::bulk(&configuration, 0x80), usbip::bulk(&configuration, 0));
+        Kernel { kernel, input, output }
     }
 }
 
@@ -89,65 +81,21 @@ impl Drop for Server {
 
 /// A connection that has the device.
 struct Kernel {
-    stream: TcpStream,
-    seq: u32,
+    kernel: usbip::Kernel,
     /// The serial port's endpoints.
     input: u32,
     output: u32,
 }
 
-/// The number of the bulk endpoint of a direction.
-fn bulk(configuration: &[u8], direction: u8) -> u32 {
-    let mut rest = configuration;
-    while let [length, kind, ..] = *rest {
-        if kind == 5 && rest[3] == 2 && rest[2] & 0x80 == direction {
-            return (rest[2] & 15).into();
-        }
-        rest = &rest[length.into()..];
-    }
-    panic!("no bulk endpoint");
-}
-
 impl Kernel {
-    fn read(&mut self, length: usize) -> Vec<u8> {
-        let mut bytes = vec![0; length];
-        self.stream.read_exact(&mut bytes).unwrap();
-        bytes
-    }
-
-    /// Submits a transfer and returns its number.
-    fn submit(&mut self, endpoint: u32, input: bool, length: u32, setup: [u8; 8], data: &[u8]) -> u32 {
-        self.seq += 1;
-        let head = [1, self.seq, 0x1_0002, input.into(), endpoint, 0, length, 0, 0, 0];
-        let mut bytes: Vec<u8> = head.iter().flat_map(|word| word.to_be_bytes()).collect();
-        bytes.extend(setup);
-        bytes.extend(data);
-        self.stream.write_all(&bytes).unwrap();
-        self.seq
-    }
-
-    /// The next completed transfer: its number, its status, and its data if that came in.
-    fn end(&mut self, input: bool) -> (u32, i32, Vec<u8>) {
-        let head = self.read(48);
-        let word = |n: usize| u32::from_be_bytes(head[4 * n..4 * n + 4].try_into().unwrap());
-        let data = if input && word(0) == 3 { self.read(word(6) as usize) } else { Vec::new() };
-        (word(1), word(5) as i32, data)
-    }
-
-    /// Withdraws a transfer.
-    fn take_back(&mut self, seq: u32, victim: u32) {
-        let head = [2, seq, 0x1_0002, 0, 0, victim, 0, 0, 0, 0, 0, 0];
-        let bytes: Vec<u8> = head.iter().flat_map(|word: &u32| word.to_be_bytes()).collect();
-        self.stream.write_all(&bytes).unwrap();
+    /// The next message: its number, its status, and the data that came.
+    fn end(&mut self) -> (u32, i32, Vec<u8>) {
+        let ended = self.kernel.next(PATIENCE).unwrap().expect("it ends");
+        (ended.seq, ended.status, ended.data)
     }
 
     fn control(&mut self, setup: [u8; 8], data: &[u8]) -> (i32, Vec<u8>) {
-        let input = setup[0] & 0x80 != 0;
-        let length = u16::from_le_bytes([setup[6], setup[7]]).into();
-        let seq = self.submit(0, input, length, setup, data);
-        let (ended, status, data) = self.end(input);
-        assert_eq!(ended, seq);
-        (status, data)
+        self.kernel.control(setup, data, PATIENCE).unwrap()
     }
 
     fn set_lines(&mut self, dtr: bool) {
@@ -156,13 +104,13 @@ impl Kernel {
 
     /// Writes to the serial port.
     fn write(&mut self, bytes: &[u8]) {
-        let seq = self.submit(self.output, false, bytes.len() as u32, [0; 8], bytes);
-        assert_eq!(self.end(false), (seq, 0, vec![]));
+        let seq = self.kernel.submit(self.output, false, bytes.len() as u32, [0; 8], bytes).unwrap();
+        assert_eq!(self.end(), (seq, 0, vec![]));
     }
 
     /// Begins to read from it.
     fn begin_read(&mut self) -> u32 {
-        self.submit(self.input, true, 128, [0; 8], &[])
+        self.kernel.submit(self.input, true, 128, [0; 8], &[]).unwrap()
     }
 
     /// Reads until the bytes end like this.
@@ -170,7 +118,7 @@ impl Kernel {
         let mut text = Vec::new();
         while !text.ends_with(end.as_bytes()) {
             let seq = self.begin_read();
-            let (ended, status, data) = self.end(true);
+            let (ended, status, data) = self.end();
             assert_eq!((ended, status), (seq, 0));
             text.extend(data);
         }
@@ -187,7 +135,7 @@ impl Kernel {
 }
 
 fn wait_for<T>(mut what: impl FnMut() -> Option<T>) -> T {
-    let until = Instant::now() + Duration::from_mins(1);
+    let until = Instant::now() + PATIENCE;
     loop {
         if let Some(found) = what() {
             return found;
@@ -222,9 +170,8 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
     let mut kernel = server.attach();
     kernel.set_lines(true);
     let victim = kernel.begin_read();
-    kernel.seq += 1;
-    kernel.take_back(kernel.seq, victim);
-    assert_eq!(kernel.end(false), (kernel.seq, ECONNRESET, vec![]));
+    let seq = kernel.kernel.take_back(victim).unwrap();
+    assert_eq!(kernel.end(), (seq, ECONNRESET, vec![]));
     kernel.converse(&[("V", "V1001\r")]);
 }
 
@@ -235,11 +182,10 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
 fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
     let server = Server::start();
     let mut kernel = server.attach();
-    let (seq, victim) = (kernel.seq + 2, kernel.seq + 1);
-    kernel.take_back(seq, victim);
-    assert_eq!(kernel.end(false), (seq, ECONNRESET, vec![]));
-    assert_eq!(kernel.submit(0, true, 1, [0x80, 8, 0, 0, 0, 0, 1, 0], &[]), victim);
-    kernel.seq = seq;
+    let victim = kernel.kernel.next_seq() + 1;
+    let seq = kernel.kernel.take_back(victim).unwrap();
+    assert_eq!(kernel.end(), (seq, ECONNRESET, vec![]));
+    assert_eq!(kernel.kernel.submit(0, true, 1, [0x80, 8, 0, 0, 0, 0, 1, 0], &[]).unwrap(), victim);
     assert_eq!(kernel.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
 }
 
@@ -257,11 +203,11 @@ fn a_request_that_the_device_refuses_ends_with_a_stall() {
 fn one_kernel_has_the_device_and_another_may_when_it_is_gone() {
     let server = Server::start();
     let kernel = server.attach();
-    assert_eq!(server.import(b"1-1").read(8)[4..], [0, 0, 0, 1], "somebody has it");
+    assert_eq!(server.import("1-1").bytes(8)[4..], [0, 0, 0, 1], "somebody has it");
     drop(kernel);
     // The end of a connection is noticed a moment later.
-    wait_for(|| (server.import(b"1-1").read(8)[4..] == [0; 4]).then_some(()));
-    assert_eq!(server.import(b"7-7").read(8)[4..], [0, 0, 0, 1], "there is no such device");
+    wait_for(|| (server.import("1-1").bytes(8)[4..] == [0; 4]).then_some(()));
+    assert_eq!(server.import("7-7").bytes(8)[4..], [0, 0, 0, 1], "there is no such device");
 }
 
 #[test]
@@ -272,8 +218,7 @@ fn a_pulled_cable_ends_the_connection_without_answers() {
     kernel.set_lines(true);
     kernel.begin_read();
     server.say("unplug");
-    let mut rest = Vec::new();
-    kernel.stream.read_to_end(&mut rest).unwrap();
+    let rest = kernel.kernel.rest();
     assert!(rest.is_empty(), "{rest:?}");
     server.attach();
 }

@@ -119,8 +119,8 @@ impl GsUsb {
             });
         }
         let mut adapter = Self {
+            row: row_of(&channels, usb.confirms()),
             usb,
-            row: row_of(&channels),
             serial,
             version,
             channels,
@@ -186,7 +186,7 @@ impl GsUsb {
         let number = usize::from(transfer.channel);
         let Some(channel) = Channel::from_number(transfer.channel + 1) else { return };
         let at = match transfer.stamp_us {
-            Some(stamp_us) => self.clock.place(stamp_us.into(), arrival),
+            Some(stamp_us) => self.clock.place(stamp_us.into(), arrival, &mut self.oddities),
             None => At::arrival(arrival),
         };
         if transfer.overflow {
@@ -297,9 +297,11 @@ impl GsUsb {
 }
 
 /// What such an adapter can tell.
-fn row_of(channels: &[Can]) -> &'static Row {
+fn row_of(channels: &[Can], confirms: bool) -> &'static Row {
     let has = |feature| channels.iter().all(|can| can.constants.has(feature));
     let board = match (has(feature::LISTEN_ONLY), has(feature::STAMPS)) {
+        (true, true) if confirms => "gs_usb-confirmed",
+        (true, false) if confirms => "gs_usb-arrival-confirmed",
         (true, true) => "gs_usb",
         (true, false) => "gs_usb-arrival",
         (false, true) => "gs_usb-normal",

@@ -6,6 +6,10 @@ use crate::source::Piece;
 
 /// Two pipes and vendor requests: another one in tests.
 pub(super) trait Usb: Send {
+    /// Whether its firmware is known to return a frame only once it was on the bus.
+    fn confirms(&self) -> bool {
+        false
+    }
     /// A request with data for the adapter.
     fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String>;
     /// A request that it answers in time.

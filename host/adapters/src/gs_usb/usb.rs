@@ -20,9 +20,9 @@ const KNOWN: [(u16, u16); 6] = [
     (0x16D0, 0x10B8),
     // Xylanta SAINT3.
     (0x16D0, 0x0F30),
-    // CANnectivity.
-    (0x1209, 0xCA01),
+    CANNECTIVITY,
 ];
+const CANNECTIVITY: (u16, u16) = (0x1209, 0xCA01);
 const INTERFACE: u8 = 0;
 /// Time limit for a request with data for the adapter.
 const REQUEST_WITHIN: Duration = Duration::from_secs(1);
@@ -39,6 +39,7 @@ pub(super) struct UsbAdapter {
     interface: Interface,
     source: Source<Vec<u8>>,
     out: Endpoint<Bulk, Out>,
+    confirms: bool,
 }
 
 /// A serial number as people see it, and type it.
@@ -86,7 +87,8 @@ impl UsbAdapter {
         let out = interface.endpoint::<Bulk, Out>(to).map_err(failed)?;
         let source =
             reader(input).map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })?;
-        Ok((Self { interface, source, out }, number.clone()))
+        let confirms = (device.vendor_id(), device.product_id()) == CANNECTIVITY;
+        Ok((Self { interface, source, out, confirms }, number.clone()))
     }
 }
 
@@ -132,6 +134,10 @@ const fn advice(kind: ErrorKind) -> &'static str {
 }
 
 impl Usb for UsbAdapter {
+    fn confirms(&self) -> bool {
+        self.confirms
+    }
+
     fn control_out(&mut self, request: u8, value: u16, data: &[u8]) -> Result<(), String> {
         let (control_type, recipient, index) = (ControlType::Vendor, Recipient::Interface, INTERFACE.into());
         let request = ControlOut { control_type, recipient, request, value, index, data };

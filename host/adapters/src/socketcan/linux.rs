@@ -45,6 +45,13 @@ fn is_can(network: &Path, name: &str) -> bool {
             .is_ok_and(|kind| kind.trim() == TYPE_OF_CAN)
 }
 
+/// Whether its driver takes an adapter's word that a frame was sent, as `gs_usb` does: candleLight's firmware returns a frame when its controller has
+/// it, which is before it is on the bus, if it ever is.
+fn echoes_early(network: &Path, name: &str) -> bool {
+    let driver = std::fs::read_link(network.join(name).join("device/driver"));
+    driver.is_ok_and(|driver| driver.file_name().is_some_and(|name| name == "gs_usb"))
+}
+
 /// An interface of this computer.
 pub(crate) struct LinuxInterface {
     name: String,
@@ -75,7 +82,8 @@ fn ask(name: &str) -> io::Result<Link> {
 
 impl Interface for LinuxInterface {
     fn look(&mut self) -> io::Result<Link> {
-        ask(&self.name)
+        let link = ask(&self.name)?;
+        Ok(Link { echoes: link.echoes && !echoes_early(Path::new(NETWORK), &self.name), ..link })
     }
 
     fn open(&mut self) -> io::Result<()> {
@@ -132,6 +140,19 @@ mod tests {
         let is_can = |name| is_can(folder.path(), name);
         assert!(is_can("can0"));
         assert!(!is_can("lo") && !is_can("can1") && !is_can("") && !is_can("..") && !is_can("can0/../can0"));
+    }
+
+    #[test]
+    fn what_the_driver_of_gs_usb_adapters_returns_is_no_proof() {
+        let folder = tempfile::tempdir().unwrap();
+        for (name, driver) in [("can0", "gs_usb"), ("can1", "peak_usb")] {
+            let device = folder.path().join(name).join("device");
+            std::fs::create_dir_all(&device).unwrap();
+            std::os::unix::fs::symlink(format!("../../bus/usb/drivers/{driver}"), device.join("driver"))
+                .unwrap();
+        }
+        let early = |name| echoes_early(folder.path(), name);
+        assert!(early("can0") && !early("can1") && !early("vcan0"));
     }
 
     /// This kernel may know nothing about CAN, but it knows its own interfaces.

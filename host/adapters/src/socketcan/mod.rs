@@ -170,7 +170,7 @@ impl SocketCan {
             self.count_dropped(dropped, At::arrival(arrival));
         }
         let at = match message.hardware {
-            Some(stamp) => self.clock.place(stamp.as_nanos() as u64, arrival),
+            Some(stamp) => self.clock.place(stamp.as_nanos() as u64, arrival, &mut self.oddities),
             None => At::arrival(arrival),
         };
         match content(message.bytes()) {
@@ -345,7 +345,8 @@ fn row_of(link: &Link, has_hardware_stamps: bool) -> &'static Row {
         (None, ..) => "socketcan-virtual",
         (_, true, true, _) => "socketcan-hw-silent",
         (_, true, false, _) => "socketcan-silent",
-        (_, false, true, _) => "socketcan-hw",
+        (_, false, true, true) => "socketcan-hw",
+        (_, false, true, false) => "socketcan-hw-no-echo",
         (_, false, false, true) => "socketcan",
         (_, false, false, false) => "socketcan-no-echo",
     };

@@ -333,6 +333,7 @@ fn the_row_is_that_of_the_interface() {
     assert_eq!(board(&silent, false), "socketcan-silent");
     assert_eq!(board(&silent, true), "socketcan-hw-silent");
     assert_eq!(board(&Link { echoes: false, ..controller() }, false), "socketcan-no-echo");
+    assert_eq!(board(&Link { echoes: false, ..controller() }, true), "socketcan-hw-no-echo");
     assert_eq!(board(&Link { bitrate_bps: None, ..controller() }, false), "socketcan-virtual");
 }
 

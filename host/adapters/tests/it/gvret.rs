@@ -163,6 +163,58 @@ fn frames_of_a_bus_with_can_fd_are_read_if_the_address_has_its_data_bit_rate() {
     drop(seen);
 }
 
+/// Half a message, and then whole ones: no frame is made of bytes of two.
+#[test]
+fn no_frame_is_made_of_the_pieces_of_two() {
+    let (address, streams, _seen) = start(true);
+    let device = open(&address);
+    let mut adapter = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    let whole = received(1000, 0x123, 0, &[0x11, 0x22, 0x33, 0x44, 0x55, 0x66, 0x77, 0x88]);
+    for cut in 11..whole.len() {
+        let next = received(2000 + cut as u32, 0x200 + cut as u32, 0, &[0x99; 8]);
+        adapter.write_all(&[&whole[..cut], &next, &received(3000, 0x7FF, 0, &[])].concat()).unwrap();
+        let records = until_frame(&device, "7FF#");
+        let expected = [format!("{:03X}#9999999999999999", 0x200 + cut), "7FF#".to_owned()];
+        assert_eq!(frames(&records), expected, "{cut}");
+        assert_eq!(losses(&records), [("link", 1)], "{cut}");
+    }
+}
+
+/// A clock that stands still, goes back and leaps: each frame is there, in order, and no later than it arrived.
+#[test]
+fn absurd_stamps_cost_no_frame_and_are_counted() {
+    let (address, streams, _seen) = start(true);
+    let device = open(&address);
+    let mut adapter = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    let stamps: [fn(u32) -> u32; 4] = [
+        |_| 7_000_000,
+        |number| 90_000_000 - number * 100,
+        |number| number.wrapping_mul(2_654_435_761),
+        |number| if number.is_multiple_of(2) { u32::MAX } else { 0 },
+    ];
+    let mut last = i64::MIN;
+    for (kind, stamp) in (1..).zip(stamps) {
+        for number in 0..60 {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+            adapter.write_all(&received(stamp(number), 0x100 * kind + number, 0, &[])).unwrap();
+        }
+        let records = until_frame(&device, &format!("{:03X}#", 0x100 * kind + 59));
+        let expected: Vec<String> = (0..60).map(|number| format!("{:03X}#", 0x100 * kind + number)).collect();
+        assert_eq!(frames(&records), expected);
+        let now = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap().as_nanos() as i64;
+        for time_ns in records.iter().filter(|record| record.frame().is_some()).map(|record| record.time_ns) {
+            assert!(time_ns >= last && time_ns <= now, "{time_ns} after {last}, before {now}");
+            last = time_ns;
+        }
+    }
+    let failures = device.failures().unwrap().last;
+    assert!(failures.contains("stamps that stand still or go back"), "{failures}");
+    assert!(failures.contains("stamps that contradict their arrival"), "{failures}");
+    assert_eq!(device.counters().channels[0].lost(), 0);
+}
+
 #[test]
 fn one_that_does_not_listen_silently_is_not_left_open() {
     let (address, _streams, seen) = start(false);

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use cantap::wire::Refusal;
 use cantap::wire::message::{Filter, Modifier, Periodic, Trigger, capability};
 use cantap::{Channel, DeviceError, TraceEvent};
-use cantap_adapters::{ListenOnly, row};
+use cantap_adapters::{ListenOnly, OpenError, row};
 
 use crate::port::Port;
 use crate::{frames, losses, open, send, until, until_frame};
@@ -19,6 +19,8 @@ enum Manner {
     Canable,
     /// Answers what belongs to the greeting, and nothing afterwards.
     Stalling,
+    /// Each answer comes once more, with the next command; `L` is refused.
+    Twice,
     /// Refuses the first of every two frames, because its queue is full.
     Full,
 }
@@ -33,12 +35,16 @@ impl StandIn {
         let commands = Arc::new(Mutex::new(Vec::new()));
         let log = Arc::clone(&commands);
         let (mut line, mut state) = (String::new(), State::default());
+        let mut again = "";
         let port = Port::start(move |byte| {
             if byte != b'\r' {
                 line.push(char::from(byte));
-                return Vec::new();
+                return std::mem::take(&mut again).as_bytes().to_vec();
             }
             let answer = state.answer(manner, &line);
+            if manner == Manner::Twice {
+                again = answer;
+            }
             log.lock().unwrap().push(std::mem::take(&mut line));
             answer.as_bytes().to_vec()
         });
@@ -85,7 +91,7 @@ impl State {
             Some('V') => "V1013\r",
             Some('N') => "NA123\r",
             Some('S') if self.open.is_none() && ("S0"..="S8").contains(&line) => OK,
-            Some('L') if manner == Manner::WithoutListening => NO,
+            Some('L') if matches!(manner, Manner::WithoutListening | Manner::Twice) => NO,
             Some(mode @ ('O' | 'L')) if self.open.is_none() => {
                 self.open = Some(mode);
                 self.opened += 1;
@@ -232,6 +238,26 @@ fn one_that_stalls_is_refused_and_holds_up_nothing() {
     assert!(matches!(refused, DeviceError::Refused { refusal: Refusal::Hardware }), "{refused}");
     device.status().unwrap();
     drop(adapter);
+}
+
+/// Its refusal to only listen would be taken for the answer to another command.
+#[test]
+fn one_whose_answers_come_twice_is_not_opened() {
+    let adapter = StandIn::start(Manner::Twice);
+    let place: cantap_adapters::Place = adapter.address().parse().unwrap();
+    let error = cantap_adapters::open(&place).err().unwrap();
+    assert!(matches!(error, OpenError::Foreign { .. }), "{error}");
+    assert!(error.to_string().contains("that no other program uses it"), "{error}");
+}
+
+#[test]
+fn answers_to_nothing_are_counted_and_confirm_nothing() {
+    let adapter = StandIn::start(Manner::Lawicel);
+    let device = open(&adapter.address());
+    device.join(Channel::Can1, 500_000).unwrap();
+    adapter.says("z\rZ\r\rt7FF0\r");
+    assert_eq!(frames(&until_frame(&device, "7FF#")), ["7FF#"]);
+    assert!(device.failures().unwrap().last.contains("3 answers to nothing"));
 }
 
 #[test]

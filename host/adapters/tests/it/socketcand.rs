@@ -64,6 +64,32 @@ fn frames_come_and_go_and_what_cannot_be_read_is_a_loss() {
     assert!(send(&device, "123#R").result.is_err());
 }
 
+/// No bytes are left out in silence: those between messages, and a message in which the next begins.
+#[test]
+fn what_is_no_message_is_a_loss_each_time_and_stamps_that_stand_still_are_not_believed() {
+    let (place, streams, _messages) = start("can0");
+    let device = open(&format!("socketcand://{place}/can0"));
+    let mut server = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    server.write_all(b"< frame 1 1.0 >rubbish frame 2 2.0 >< frame 3 1.1< frame 4 1.2 >\n\n").unwrap();
+    assert_eq!(losses(&until_frame(&device, "004#")), [("link", 1); 2]);
+    let mut times = Vec::new();
+    for id in 0x100..0x110 {
+        std::thread::sleep(std::time::Duration::from_millis(10));
+        server.write_all(format!("< frame {id:X} 1.2 >").as_bytes()).unwrap();
+        times.extend(until_frame(&device, &format!("{id:X}#")).iter().map(|record| record.time_ns));
+    }
+    assert!(times.is_sorted(), "{times:?}");
+    // The first 20 ms are believed.
+    assert!(times[15] - times[0] >= 100_000_000, "{times:?}");
+    let failures = device.failures().unwrap().last;
+    assert!(failures.contains("stamps that stand still or go back"), "{failures}");
+    assert!(
+        failures.contains("1 bytes outside of messages") && failures.contains("1 messages without an end"),
+        "{failures}"
+    );
+}
+
 #[test]
 fn an_interface_that_is_not_there_is_refused() {
     let (place, _streams, _messages) = start("can0");

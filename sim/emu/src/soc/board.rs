@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use super::exti::Exti;
 use super::flash::{self, FlashInterface};
 use super::odd::{OddAccess, Oddity};
-use super::rcc::{Crystal, Rcc, ResetCause};
+use super::rcc::{Clocks, Crystal, Rcc, ResetCause};
 use super::small::{Adc, Crc, Gpio, Storage, Watchdog};
 use super::timer::Timer;
 use super::transmit_pins::{self, Driven, TransmitPins};
@@ -366,6 +366,11 @@ impl Board {
         for wire in &mut self.wires {
             wire.hold_dominant(hold, &mut self.can);
         }
+    }
+
+    /// The clock tree as the program has set it up.
+    pub fn clocks(&self) -> Clocks {
+        self.rcc.clocks()
     }
 
     /// The settings made by the program that affect the core's timing.

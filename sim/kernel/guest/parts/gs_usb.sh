@@ -44,8 +44,8 @@ check "gs_usb: the kernel's driver takes the stand-in for what it is" has_interf
 can_is_up can0 off && can_is_up can1 off
 verdict $? "gs_usb, kernel: both channels are up"
 "$CANTAP" info -d can0 > info.txt 2>&1
-grep -q "controller's hardware clock" info.txt && grep -q "confirmed once a frame was on the bus" info.txt && grep -q "acknowledges frames while it is up" info.txt
-verdict $? "gs_usb, kernel: hardware stamps, confirmations and the mode are in the row"
+grep -q "controller's hardware clock" info.txt && grep -q "accepted by the adapter" info.txt && grep -q "acknowledges frames while it is up" info.txt
+verdict $? "gs_usb, kernel: hardware stamps, that an echo proves nothing, and the mode are in the row"
 
 gs_start -d can0
 wait_until receives can0 1

@@ -136,7 +136,7 @@ impl<'py> FromPyObject<'_, 'py> for Seconds {
         if object.is_instance_of::<PyDelta>() {
             return object.call_method0("total_seconds")?.extract().map(Self);
         }
-        if object.get_type().name()?.to_string() == "timedelta64" {
+        if object.get_type().name()? == "timedelta64" {
             let ns: i64 =
                 object.call_method1("astype", ("m8[ns]",))?.call_method1("astype", ("int64",))?.extract()?;
             // NumPy's NaT is no time.

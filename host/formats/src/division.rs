@@ -21,7 +21,7 @@ pub struct TimePart {
 #[derive(Default)]
 struct Cuts {
     /// The first time of each part but the first, and how many records are before it.
-    cuts: Vec<(i64, u64, u64)>,
+    begins: Vec<(i64, u64, u64)>,
     records: u64,
     latest_ns: Option<i64>,
 }
@@ -30,22 +30,22 @@ impl Cuts {
     /// The next record; `position` is how far the file was read, about.
     fn push(&mut self, time_ns: i64, position: u64, part_bytes: u64) {
         // What belongs before a cut by its time must be before it.
-        while self.cuts.last().is_some_and(|(start_ns, ..)| time_ns < *start_ns) {
-            self.cuts.pop();
+        while self.begins.last().is_some_and(|(start_ns, ..)| time_ns < *start_ns) {
+            self.begins.pop();
         }
-        let begin = self.cuts.last().map_or(0, |(_, _, position)| *position);
+        let begin = self.begins.last().map_or(0, |(_, _, position)| *position);
         if position.saturating_sub(begin) >= part_bytes
             && self.latest_ns.is_some_and(|latest| time_ns > latest)
         {
-            self.cuts.push((time_ns, self.records, position));
+            self.begins.push((time_ns, self.records, position));
         }
         self.latest_ns = self.latest_ns.max(Some(time_ns));
         self.records += 1;
     }
 
     fn parts(&self) -> Vec<TimePart> {
-        let starts = std::iter::once((None, 0)).chain(self.cuts.iter().map(|cut| (Some(cut.0), cut.1)));
-        let ends = self.cuts.iter().map(|cut| (Some(cut.0), cut.1)).chain([(None, self.records)]);
+        let starts = std::iter::once((None, 0)).chain(self.begins.iter().map(|cut| (Some(cut.0), cut.1)));
+        let ends = self.begins.iter().map(|cut| (Some(cut.0), cut.1)).chain([(None, self.records)]);
         starts
             .zip(ends)
             .map(|((start_ns, before), (end_ns, until))| TimePart {
@@ -127,11 +127,12 @@ mod tests {
 
         let folder = tempfile::tempdir().unwrap();
         let trace = folder.path().join("drive.log");
-        let lines: String = (0..500)
+        let lines: Vec<_> = (0..500)
             // Now and then one comes late.
             .map(|at| (at, if at % 50 == 49 { at - 3 } else { at }))
             .map(|(at, time)| format!("(1700000000.{time:06}) can{} 123#{at:04X}\n", at % 2))
             .collect();
+        let lines = lines.concat();
         std::fs::write(&trace, lines).unwrap();
         let options = ReadOptions {
             index: Some(crate::IndexFolder::new(folder.path().join("index"))),
@@ -155,7 +156,8 @@ mod tests {
     #[test]
     fn what_is_damaged_or_compressed_is_not_divided() {
         let folder = tempfile::tempdir().unwrap();
-        let lines: String = (0..500).map(|at| format!("(1.{at:06}) can0 123#11\n")).collect();
+        let lines: Vec<_> = (0..500).map(|at| format!("(1.{at:06}) can0 123#11\n")).collect();
+        let lines = lines.concat();
         let options = ReadOptions::default();
         let bad = folder.path().join("bad.log");
         std::fs::write(&bad, format!("{lines}nonsense\n")).unwrap();

@@ -118,7 +118,8 @@ fn tidy(fields: &mut Vec<Field>) {
         let name = field.name.to_ascii_lowercase();
         if field.kind == Kind::Text && matches!(name.as_str(), "is_rx" | "isrx") {
             "direction".clone_into(&mut field.name);
-            field.value = if field.value == "true" { "rx" } else { "tx" }.to_owned();
+            let direction = if field.value == "true" { "rx" } else { "tx" };
+            direction.clone_into(&mut field.value);
         }
     }
 }

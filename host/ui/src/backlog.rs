@@ -123,12 +123,12 @@ impl Backlog {
             // Whoever comes back with a number of the future has it from elsewhere.
             let from = state.chunks.partition_point(|chunk| chunk.next <= cursor.next);
             let mut bytes = 0;
-            let fits = |chunk: &&Box<Chunk>| {
+            let mut fits = |chunk: &Chunk| {
                 let is_first = bytes == 0;
                 bytes += chunk.packed.len() + 4;
                 is_first || bytes <= most_bytes
             };
-            let found: Vec<_> = state.chunks.range(from..).take_while(fits).collect();
+            let found: Vec<_> = state.chunks.range(from..).take_while(|chunk| fits(chunk)).collect();
             let last = found.last()?.next;
             let after =
                 state.chunks.get(from + found.len()).map_or(&state.frames, |chunk| &chunk.before).clone();

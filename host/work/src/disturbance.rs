@@ -160,7 +160,9 @@ impl Run<'_> {
                 return Ok(Some(expected));
             }
             let Some(batch) = self.records.next(LOOK_EVERY)? else { return Ok(None) };
-            batch.iter().for_each(|record| prediction.take(record));
+            for record in batch.iter() {
+                prediction.take(record);
+            }
         }
     }
 

@@ -230,7 +230,7 @@ mod tests {
         let load = |data_bitrate_bps| {
             let mut meter = meter(|_| {}, &[]).with_data_bitrate(data_bitrate_bps);
             (0..3).for_each(|at| {
-                meter.push(&TraceRecord { time_ns: at * 1_000_000, device_ns: None, channel: 1, event })
+                meter.push(&TraceRecord { time_ns: at * 1_000_000, device_ns: None, channel: 1, event });
             });
             (meter.bus_load_pct(), meter.no_bus_load_because())
         };

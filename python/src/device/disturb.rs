@@ -43,8 +43,8 @@ fn error(error: anyhow::Error) -> Error {
 /// Disturbs a bus: at a time from now on, or onto the frames of an identifier. Returns what became of each, as `cantap disturb --json` prints it.
 #[expect(clippy::too_many_arguments, reason = "what Python's half passes, each by its name")]
 #[pyfunction]
-fn disturb<'py>(
-    py: Python<'py>,
+fn disturb(
+    py: Python<'_>,
     device: Py<Device>,
     number: OfDevice,
     at: Option<Seconds>,
@@ -53,7 +53,7 @@ fn disturb<'py>(
     length: Whole<u8>,
     count: Whole<u32>,
     every: Seconds,
-) -> PyResult<Vec<Bound<'py, PyAny>>> {
+) -> PyResult<Vec<Bound<'_, PyAny>>> {
     let session = device.get().session()?;
     let when = match (at, id) {
         (Some(first), None) => When::At { first: duration(first.0)?, every: duration(every.0)? },

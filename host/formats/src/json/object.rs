@@ -28,7 +28,6 @@ pub(super) fn next(text: &[u8], inside: bool) -> Next {
             b'{' => return object(text, at),
             // RS begins each text of a JSON text sequence (RFC 7464).
             b' ' | b'\t' | b'\r' | b'\n' | b',' | b'[' | b']' | 0x1E => at += 1,
-            b'}' if inside => at += 1,
             b'"' if inside => match string_end(text, at) {
                 StringEnd::At(end) => at = end,
                 StringEnd::Broken(_) => at += 1,

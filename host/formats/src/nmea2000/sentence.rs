@@ -145,6 +145,8 @@ impl<'a> Line<'a> {
 impl Habits {
     /// Looks at a file's first lines.
     pub fn of<'a>(lines: impl Iterator<Item = &'a [u8]>) -> Self {
+        /// A count that goes on tells as much as so many fill bytes.
+        const CERTAIN: u32 = 8;
         let (mut first, mut last) = (0, 0);
         let (mut stamps, mut before) = (Vec::new(), None);
         for line in lines.filter_map(Line::of) {
@@ -157,7 +159,6 @@ impl Habits {
                         first += u32::from(end == 0xFF && start != 0xFF);
                         last += u32::from(start == 0xFF && end != 0xFF);
                         // A fast packet counts its frames in their first bytes.
-                        const CERTAIN: u32 = 8;
                         let group = message.id.map(|id| id & 0x3FF_FFFF);
                         if let Some((same, was_start, was_end)) = before
                             && same == group

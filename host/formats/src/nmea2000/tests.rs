@@ -86,7 +86,10 @@ fn broken_lines_are_named() {
     assert_eq!((log.lines().count(), issues.len()), (1, 0), "{issues:?}");
 }
 
-fn read(file: &str) -> (String, Vec<String>, Vec<(String, u64)>, Vec<&'static str>) {
+/// As candump, issues, what was noted, what was left out.
+type Found = (String, Vec<String>, Vec<(String, u64)>, Vec<&'static str>);
+
+fn read(file: &str) -> Found {
     assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Nmea2000), "{file}");
     let (log, issues) = as_log(file);
     let source = std::io::Cursor::new(file.to_owned());

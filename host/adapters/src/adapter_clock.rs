@@ -42,7 +42,6 @@ pub(crate) struct AdapterClock {
 }
 
 #[derive(Clone, Copy)]
-#[expect(clippy::struct_field_names, reason = "the unit is part of each name")]
 struct State {
     /// Adapter time of the first stamp and of the last, unwrapped, in nanoseconds.
     first_ns: i128,

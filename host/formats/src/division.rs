@@ -94,7 +94,7 @@ pub fn divide(
     }
     let parts = cuts.parts();
     // Times before 1970 cannot be asked for.
-    let is_divided = parts.len() > 1 && cuts.cuts.iter().all(|(start_ns, ..)| *start_ns >= 0);
+    let is_divided = parts.len() > 1 && cuts.begins.iter().all(|(start_ns, ..)| *start_ns >= 0);
     Ok(is_divided.then_some(parts))
 }
 

@@ -160,7 +160,7 @@ impl Run<'_> {
                 return Ok(Some(expected));
             }
             let Some(batch) = self.records.next(LOOK_EVERY)? else { return Ok(None) };
-            for record in batch.iter() {
+            for record in &batch {
                 prediction.take(record);
             }
         }

@@ -65,7 +65,7 @@ impl Server {
         assert_eq!(reply[8 + 300..8 + 304], [0x12, 0x09, 0, 1], "vendor and product");
         let configuration = kernel.enumerate();
         let (input, output) = (usbip::bulk(&configuration, 0x80), usbip::bulk(&configuration, 0));
-        Kernel { kernel, input, output }
+        Kernel { bus: kernel, input, output }
     }
 }
 
@@ -81,7 +81,7 @@ impl Drop for Server {
 
 /// A connection that has the device.
 struct Kernel {
-    kernel: usbip::Kernel,
+    bus: usbip::Kernel,
     /// The serial port's endpoints.
     input: u32,
     output: u32,
@@ -90,12 +90,12 @@ struct Kernel {
 impl Kernel {
     /// The next message: its number, its status, and the data that came.
     fn end(&mut self) -> (u32, i32, Vec<u8>) {
-        let ended = self.kernel.next(PATIENCE).unwrap().expect("it ends");
+        let ended = self.bus.next(PATIENCE).unwrap().expect("it ends");
         (ended.seq, ended.status, ended.data)
     }
 
     fn control(&mut self, setup: [u8; 8], data: &[u8]) -> (i32, Vec<u8>) {
-        self.kernel.control(setup, data, PATIENCE).unwrap()
+        self.bus.control(setup, data, PATIENCE).unwrap()
     }
 
     fn set_lines(&mut self, dtr: bool) {
@@ -104,13 +104,13 @@ impl Kernel {
 
     /// Writes to the serial port.
     fn write(&mut self, bytes: &[u8]) {
-        let seq = self.kernel.submit(self.output, false, bytes.len() as u32, [0; 8], bytes).unwrap();
+        let seq = self.bus.submit(self.output, false, bytes.len() as u32, [0; 8], bytes).unwrap();
         assert_eq!(self.end(), (seq, 0, vec![]));
     }
 
     /// Begins to read from it.
     fn begin_read(&mut self) -> u32 {
-        self.kernel.submit(self.input, true, 128, [0; 8], &[]).unwrap()
+        self.bus.submit(self.input, true, 128, [0; 8], &[]).unwrap()
     }
 
     /// Reads until the bytes end like this.
@@ -170,7 +170,7 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
     let mut kernel = server.attach();
     kernel.set_lines(true);
     let victim = kernel.begin_read();
-    let seq = kernel.kernel.take_back(victim).unwrap();
+    let seq = kernel.bus.take_back(victim).unwrap();
     assert_eq!(kernel.end(), (seq, ECONNRESET, vec![]));
     kernel.converse(&[("V", "V1001\r")]);
 }
@@ -182,10 +182,10 @@ fn a_read_is_taken_back_and_what_it_would_have_brought_comes_with_the_next() {
 fn a_transfer_that_is_taken_back_before_it_comes_is_not_carried_out() {
     let server = Server::start();
     let mut kernel = server.attach();
-    let victim = kernel.kernel.next_seq() + 1;
-    let seq = kernel.kernel.take_back(victim).unwrap();
+    let victim = kernel.bus.next_seq() + 1;
+    let seq = kernel.bus.take_back(victim).unwrap();
     assert_eq!(kernel.end(), (seq, ECONNRESET, vec![]));
-    assert_eq!(kernel.kernel.submit(0, true, 1, [0x80, 8, 0, 0, 0, 0, 1, 0], &[]).unwrap(), victim);
+    assert_eq!(kernel.bus.submit(0, true, 1, [0x80, 8, 0, 0, 0, 0, 1, 0], &[]).unwrap(), victim);
     assert_eq!(kernel.control([0x80, 8, 0, 0, 0, 0, 1, 0], &[]), (0, vec![1]));
 }
 
@@ -218,7 +218,7 @@ fn a_pulled_cable_ends_the_connection_without_answers() {
     kernel.set_lines(true);
     kernel.begin_read();
     server.say("unplug");
-    let rest = kernel.kernel.rest();
+    let rest = kernel.bus.rest();
     assert!(rest.is_empty(), "{rest:?}");
     server.attach();
 }

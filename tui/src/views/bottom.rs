@@ -111,7 +111,9 @@ fn question(kind: PromptKind) -> &'static str {
         PromptKind::Time => {
             "go to: a time since the beginning, such as 90s, 1:30 or 1:02:03, or a share, such as 50%"
         }
-        PromptKind::Open => "open: a trace, beside what runs, or a database (.dbc .toml .arxml .kcd .sym .xlsx)",
+        PromptKind::Open => {
+            "open: a trace, beside what runs, or a database (.dbc .toml .arxml .kcd .sym .xlsx)"
+        }
         PromptKind::Record => {
             "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, each also .gz .zst)"
         }

@@ -216,7 +216,7 @@ fn each_frame_arrives_in_order_and_it_drives_no_bit() {
     board.say("play 1 50 mix 300");
     let mut received = Vec::new();
     for record in device.records() {
-        received.extend(record.unwrap().frame().map(|frame| frame.to_string()));
+        received.extend(record.unwrap().frame().map(ToString::to_string));
         if received.len() == 300 {
             break;
         }

@@ -3,7 +3,7 @@
 use cantap_columns::FrameColumns;
 use cantap_trace::grammar::any_frame;
 use cantap_trace::{
-    BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, Id, LossStage, TraceEvent, TraceFrame,
+    BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, LossStage, TraceEvent, TraceFrame,
     TraceRecord, TransmitFailure,
 };
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
@@ -19,16 +19,6 @@ use crate::table::Table;
 #[pyclass(module = "cantap", frozen, eq, hash)]
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Frame(pub TraceFrame);
-
-/// An identifier; of 29 bits if `extended` says so, or if it is too large for 11.
-pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
-    let id = if extended.unwrap_or(raw > Id::MAX_STANDARD) { Id::extended(raw) } else { Id::standard(raw) };
-    id.ok_or_else(|| {
-        Error::argument(format!(
-            "{raw:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
-        ))
-    })
-}
 
 #[pymethods]
 impl Frame {
@@ -57,7 +47,7 @@ impl Frame {
             return Self::parse(&text);
         }
         let id: Identifier = id.extract()?;
-        let id = identifier(id.raw, extended.or(id.extended))?;
+        let id = id.checked(extended)?;
         let dlc = dlc.map(|dlc| dlc.0);
         let data = data.map(|data| data.0).unwrap_or_default();
         if fd || brs || esi {

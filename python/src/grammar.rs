@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use cantap::Channel;
-use cantap_trace::grammar;
+use cantap_trace::{Id, grammar};
 use cantap_work::channel_bitrate::ChannelBitrate;
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDelta;
 
+use crate::error::Error;
 use crate::number::{Whole, short};
 
 /// The text, if it is one.
@@ -157,6 +158,20 @@ pub struct Identifier {
     pub extended: Option<bool>,
 }
 
+impl Identifier {
+    /// Of 29 bits if the caller or what was written says so, or if it is too large for 11.
+    pub fn checked(self, extended: Option<bool>) -> Result<Id, Error> {
+        let raw = self.raw;
+        let is_extended = extended.or(self.extended).unwrap_or(raw > Id::MAX_STANDARD);
+        let id = if is_extended { Id::extended(raw) } else { Id::standard(raw) };
+        id.ok_or_else(|| {
+            Error::argument(format!(
+                "{raw:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
+            ))
+        })
+    }
+}
+
 impl<'py> FromPyObject<'_, 'py> for Identifier {
     type Error = PyErr;
 
@@ -199,7 +214,7 @@ fn seconds(time: Seconds) -> PyResult<f64> {
 /// An identifier, and whether it has 29 bits.
 #[pyfunction]
 fn identifier(id: Identifier) -> PyResult<(u32, bool)> {
-    let id = crate::frame::identifier(id.raw, id.extended)?;
+    let id = id.checked(None)?;
     Ok((id.raw(), id.is_extended()))
 }
 

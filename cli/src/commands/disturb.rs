@@ -9,7 +9,7 @@ use cantap::wire::message::{MAX_DISTURBANCE_BITS, Mode};
 use cantap::{Channel, Id, TraceEvent, TraceRecord};
 use cantap_trace::grammar;
 use cantap_work::channel_options::ChannelOptions;
-use cantap_work::disturbance::{self, Outcome, Plan, When};
+use cantap_work::disturbance::{self, Disturbance, Plan, When};
 use cantap_work::interrupt;
 use cantap_work::terms::counted;
 
@@ -109,8 +109,8 @@ impl disturbance::Records for Source {
     }
 }
 
-fn print(args: &Args, outcome: &Outcome) -> anyhow::Result<()> {
-    let Outcome { at_ticks, time_ns, length_ns, errors, late_ns } = outcome;
+fn print(args: &Args, outcome: &Disturbance) -> anyhow::Result<()> {
+    let Disturbance { at_ticks, time_ns, length_ns, errors, late_ns } = outcome;
     let mut out = std::io::stdout().lock();
     if args.json {
         let object = serde_json::json!({

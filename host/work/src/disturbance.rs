@@ -58,7 +58,7 @@ pub struct Plan {
 
 /// What became of one disturbance.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Outcome {
+pub struct Disturbance {
     /// Its planned time, in the device's ticks.
     pub at_ticks: u64,
     /// When the level began, in nanoseconds since 1970.
@@ -105,7 +105,7 @@ pub fn disturb(
     device: &Device,
     plan: &Plan,
     records: &mut dyn Records,
-    mut each: impl FnMut(&Outcome) -> anyhow::Result<()>,
+    mut each: impl FnMut(&Disturbance) -> anyhow::Result<()>,
 ) -> anyhow::Result<()> {
     ensure!(
         (1..=MAX_DISTURBANCE_BITS).contains(&plan.bits),
@@ -172,11 +172,11 @@ impl Run<'_> {
         at: u64,
         expected: Option<&Expected>,
         mut prediction: Option<&mut Prediction>,
-    ) -> anyhow::Result<Option<Outcome>> {
+    ) -> anyhow::Result<Option<Disturbance>> {
         let Plan { channel, bits, .. } = *self.plan;
         self.device.disturb(channel, at, bits)?;
         let mut seen: Vec<TraceRecord> = Vec::new();
-        let mut outcome: Option<Outcome> = None;
+        let mut outcome: Option<Disturbance> = None;
         let window_ns = ((u64::from(bits) + ERROR_BITS) * self.bit_ns) as i64;
         let next_frame = |record: &TraceRecord, since_ns: i64| {
             let id = expected?.id;
@@ -197,7 +197,8 @@ impl Run<'_> {
                 seen.push(record);
                 if let TraceEvent::Disturbed { length_ns } = record.event {
                     let time_ns = record.time_ns;
-                    outcome = Some(Outcome { at_ticks: at, time_ns, length_ns, errors: 0, late_ns: None });
+                    outcome =
+                        Some(Disturbance { at_ticks: at, time_ns, length_ns, errors: 0, late_ns: None });
                 }
             }
             let now = self.device.time()?;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cantap::TraceRecord;
-use cantap_work::disturbance::{self, Outcome, Plan, When};
+use cantap_work::disturbance::{self, Disturbance, Plan, When};
 use pyo3::prelude::*;
 use serde_json::json;
 
@@ -57,12 +57,10 @@ fn disturb(
     let session = device.get().session()?;
     let when = match (at, id) {
         (Some(first), None) => When::At { first: duration(first.0)?, every: duration(every.0)? },
-        (None, Some(id)) => {
-            When::Onto { id: crate::frame::identifier(id.raw, id.extended)?, nth: nth.map(|nth| nth.0) }
-        }
+        (None, Some(id)) => When::Onto { id: id.checked(None)?, nth: nth.map(|nth| nth.0) },
         _ => return Err(Error::argument("give either at=, a time, or id=, whose frames are hit").into()),
     };
-    let outcomes = py.detach(|| -> Result<Vec<Outcome>, Error> {
+    let outcomes = py.detach(|| -> Result<Vec<Disturbance>, Error> {
         let device = session.device()?;
         disturbance::unlock(device, &session.address).map_err(error)?;
         let open = device.open_channels().into_iter().find(|(channel, _)| *channel == number.0);
@@ -84,7 +82,7 @@ fn disturb(
         .map_err(error)?;
         Ok(outcomes)
     })?;
-    let row = |outcome: &Outcome| {
+    let row = |outcome: &Disturbance| {
         json!({
             "channel": number.0.number(),
             "at_ticks": outcome.at_ticks,

@@ -15,7 +15,7 @@ use super::lock::lock;
 use super::session::{Session, SlotTable};
 use super::transmissions::{NOBODY, SenderId};
 use crate::error::Error;
-use crate::frame::{AnyFrame, identifier};
+use crate::frame::AnyFrame;
 use crate::grammar::Identifier;
 use crate::number::Whole;
 
@@ -176,7 +176,7 @@ impl Reply {
         reply: Frame,
         count: u32,
     ) -> Result<Self, Error> {
-        let id = identifier(id.raw, extended.or(id.extended))?;
+        let id = id.checked(extended)?;
         let widest = if id.is_extended() { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
         let mask = mask.map_or(widest, |mask| mask.raw);
         if mask > widest {

@@ -164,12 +164,12 @@ impl Identifier {
         let raw = self.raw;
         let is_extended = extended.or(self.extended).unwrap_or(raw > Id::MAX_STANDARD);
         let id = if is_extended { Id::extended(raw) } else { Id::standard(raw) };
-        id.ok_or_else(|| {
-            Error::argument(format!(
-                "{raw:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
-            ))
-        })
+        id.ok_or_else(|| Error::argument(no_identifier(&format!("{raw:#X}"))))
     }
+}
+
+fn no_identifier(what: &str) -> String {
+    format!("{what} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one")
 }
 
 impl<'py> FromPyObject<'_, 'py> for Identifier {
@@ -182,7 +182,9 @@ impl<'py> FromPyObject<'_, 'py> for Identifier {
         }
         match object.extract::<Whole<u32>>() {
             Ok(number) => Ok(Self { raw: number.0, extended: None }),
-            Err(error) if error.is_instance_of::<PyValueError>(object.py()) => Err(error),
+            Err(error) if error.is_instance_of::<PyValueError>(object.py()) => {
+                Err(PyValueError::new_err(no_identifier(&object.to_string())))
+            }
             Err(_) => {
                 Err(not_one_of("an identifier is a number such as 0x123, or a text such as '123'", object))
             }

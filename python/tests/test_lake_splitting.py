@@ -85,7 +85,7 @@ def test_a_large_mf4_is_read_by_its_index(tmp_path, database):
     """32 MiB and more have one: a worker then reads its part, and not the whole file."""
     import numpy as np
 
-    count = 1_200_000
+    count = 1_500_000
     frames = {
         "time": pa.array(np.arange(count) * 20_000 + 1_772_409_590 * 10**9, pa.timestamp("ns", "UTC")),
         "id": pa.array(np.where(np.arange(count) % 1000, 0x124, 0x123), pa.uint32()),
@@ -175,7 +175,7 @@ def test_the_files_of_a_divided_trace_are_joined_and_can_be_replaced(blf, tmp_pa
 
 
 def test_a_killed_part_is_no_loss(blf, tmp_path, database, monkeypatch):
-    """A worker that dies while it reads a part: the trace is read as one."""
+    """A worker that dies while it reads a part: the trace is divided otherwise, and has the same rows."""
     import sys
 
     module = sys.modules["cantap.lake.ingest"]
@@ -189,4 +189,4 @@ def test_a_killed_part_is_no_loss(blf, tmp_path, database, monkeypatch):
 
     monkeypatch.setattr(module._Workplace, "decode", dies)
     ratio, (_, [entry]) = same(blf, tmp_path, database, blf.stat().st_size // 5)
-    assert asked and ratio == 1 and entry["state"] == "read"
+    assert asked and ratio > 1.5 and entry["state"] == "read"

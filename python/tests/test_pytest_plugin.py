@@ -134,7 +134,7 @@ def test_what_is_wrong_is_said():
     with Bus() as bus:
         with pytest.raises(ValueError, match="there is no ready node"):
             bus.start("boot")
-        with pytest.raises(ValueError, match="is not a time"):
+        with pytest.raises(ValueError, match="write a time as a number and a unit"):
             bus.wait("soon")
         with pytest.raises(ValueError, match="no database"):
             bus.send("Engine")

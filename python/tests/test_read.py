@@ -202,6 +202,7 @@ def test_what_cannot_be_read_is_an_error(tmp_path, log, dbc):
         {"start": "noon"},
         {"channel": -1},
         {"channel": 300},
+        {"channel": "one"},
     ],
 )
 def test_a_wrong_value_is_a_value_error(log, arguments):
@@ -211,7 +212,7 @@ def test_a_wrong_value_is_a_value_error(log, arguments):
 
 @pytest.mark.parametrize(
     "arguments",
-    [{"db": 5}, {"filter": 5}, {"channel": "one"}, {"start": object()}, {"format": 5}, {"signals": [3], "db": None}],
+    [{"db": 5}, {"filter": 5}, {"channel": 1.5}, {"start": object()}, {"format": 5}, {"signals": [3], "db": None}],
 )
 def test_a_wrong_type_is_a_type_error(log, arguments):
     with pytest.raises(TypeError):

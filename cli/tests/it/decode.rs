@@ -63,7 +63,7 @@ fn json_lines_have_exactly_the_documented_keys() {
     assert_eq!(
         out,
         "{\"time_s\":1.000000,\"channel\":1,\"id\":\"618\",\"message\":\"Dashboard\",\"signals\":{\"Speed\":88,\"EngineSpeed\":5119.5,\"Ignition\":0}}\n\
-         {\"time_s\":1.500000,\"channel\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":1,\"F\":-2.000030517578125}}\n\
+         {\"time_s\":1.500000,\"channel\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":1,\"F\":-2.0000305}}\n\
          {\"time_s\":3.000000,\"channel\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":0,\"F\":null}}\n\
          {\"summary\":{\"decoded\":3,\"frames\":4,\"issues\":1,\"left_out\":{},\"lost\":0,\"lost_at_least\":false,\"missing_pct\":20.0,\"values\":7}}\n"
     );

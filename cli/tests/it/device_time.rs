@@ -74,7 +74,7 @@ fn every_format_with_a_place_for_it_keeps_the_devices_time() {
     assert_eq!(of_json, device);
     // A format without a place keeps the frames.
     run(&folder, "convert a.pcapng f.log");
-    assert_eq!(run(&folder, "convert f.log - --format csv-full").matches(",data,").count(), 90);
+    assert_eq!(run(&folder, "convert f.log - --format csv-full").matches(",Rx,data,").count(), 90);
 }
 
 /// The board's crystal is 400 ppm fast. UTC is corrected for that, the board's own intervals are not; `stats` measures by these.

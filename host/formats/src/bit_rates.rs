@@ -90,7 +90,8 @@ mod tests {
         let options = WriteOptions { format: Some(format), channels, ..WriteOptions::default() };
         let record = data_record(1_500_000_000_000_000_000);
         let (bytes, left_out) = tests::write_with(&options, &[record]);
-        assert!(left_out.is_empty() || matches!(format, Format::Trc(_)), "{format}");
+        // Into a stream, MF4's head has no numbers of records.
+        assert!(left_out.is_empty() || matches!(format, Format::Trc(_) | Format::Mf4), "{format}");
         let mut reader =
             TraceReader::from_source("test", Cursor::new(bytes.clone()), format, &ReadOptions::default())
                 .unwrap();

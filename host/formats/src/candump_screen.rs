@@ -135,8 +135,7 @@ impl RowFormat for Decoder {
         let line = plain(line);
         // The explanation of an error frame (-e) is on the lines below it.
         // Comments are those of the people who kept it, and `--` is what grep writes between parts.
-        let is_other =
-            line.starts_with(b"\t") || line.trim_ascii_start().starts_with(b"#") || *line == *b"--";
+        let is_other = line.starts_with(b"\t") || is_comment(&line) || *line == *b"--";
         if line.is_empty() || is_other || is_command(&line) {
             return Ok(Line::Nothing);
         }
@@ -242,6 +241,12 @@ fn byte(word: &[u8]) -> Option<u8> {
         return Some(word.iter().fold(0, |byte, digit| byte << 1 | (digit - b'0')));
     }
     hex_byte(word)
+}
+
+/// From the beginning, or in front of words: a bracket before a time can be damaged to this character.
+fn is_comment(line: &[u8]) -> bool {
+    let words = line.trim_ascii_start().strip_prefix(b"#").map(<[u8]>::trim_ascii_start);
+    line.starts_with(b"#") || words.is_some_and(|words| !words.first().is_some_and(u8::is_ascii_digit))
 }
 
 #[cfg(test)]

@@ -11,13 +11,9 @@ use std::time::{Duration, Instant};
 use cantap_formats::{
     CsvDialect, Format, ReadOptions, RotateAt, Rotation, TrcVersion, WriteOptions, create_writer, open_reader,
 };
-use traces::{directory, file_name, read, real, write};
+use traces::{directory, file_name, options, read, real, write};
 
 /// The options that write a format.
-fn options(format: Format) -> WriteOptions {
-    WriteOptions { format: Some(format), ..WriteOptions::default() }
-}
-
 #[test]
 fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
     let directory = directory("crashed");

@@ -64,16 +64,20 @@ pub fn file_name(format: Format, compression: &str) -> String {
 
 /// Writes a file and returns what it could not carry. Bit rates are in it, which other programs must not mind.
 pub fn write(path: &Path, format: Format, records: &[TraceRecord]) -> LeftOut {
-    let rate = |(channel, bps)| ChannelInfo { channel, bitrate_bps: Some(bps), description: String::new() };
-    // In pcapng each of them would be an interface, whatever comes.
-    let rates: &[_] = if format == Format::Pcapng { &[] } else { &[(1, 500_000), (2, 83_333)] };
-    let channels = rates.iter().copied().map(rate).collect();
-    let options = WriteOptions { format: Some(format), channels, ..WriteOptions::default() };
-    let mut writer = create_writer(path, &options).unwrap();
+    let mut writer = create_writer(path, &options(format)).unwrap();
     for record in records {
         writer.write(record).unwrap();
     }
     writer.finish().unwrap()
+}
+
+/// For files that say the bit rates, where they have a place for them.
+pub fn options(format: Format) -> WriteOptions {
+    let rate = |(channel, bps)| ChannelInfo { channel, bitrate_bps: Some(bps), description: String::new() };
+    // In pcapng each of them would be an interface, whatever comes.
+    let rates: &[_] = if format == Format::Pcapng { &[] } else { &[(1, 500_000), (2, 83_333)] };
+    let channels = rates.iter().copied().map(rate).collect();
+    WriteOptions { format: Some(format), channels, ..WriteOptions::default() }
 }
 
 /// A file's records and the messages about it.

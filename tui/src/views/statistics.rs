@@ -188,7 +188,10 @@ fn gauge(
     // The mean of a bus that stopped is of the time before.
     let covered_ns = channel.covered_ns();
     let over = if is_of_a_part(covered_ns as f64, observed_ns as f64) {
-        format!(" over {}", duration(covered_ns as i64))
+        match covered_ns {
+            ..60_000_000_000 => format!(" over {:.1} s", covered_ns as f64 / 1e9),
+            _ => format!(" over {}", duration(covered_ns as i64)),
+        }
     } else {
         String::new()
     };

@@ -140,7 +140,7 @@ def test_what_is_wrong_is_said():
             bus.send("Engine")
         with pytest.raises(ValueError, match="neither an identifier"):
             bus.expect("Engine", within=1)
-        with pytest.raises(ValueError, match="not a channel"):
+        with pytest.raises(ValueError, match="there is no channel"):
             bus.send("123#", channel=3)
         bus.start("obd", vin="SHORT")
         bus.wait("1ms")

@@ -156,6 +156,8 @@ pub struct Intake {
     disorder_ticks: u64,
     /// Whether the device counts its losses.
     counts_losses: bool,
+    /// Whether its times are those of its own clock: another maker's adapter's have been placed in this computer's time already.
+    has_own_clock: bool,
     /// Whether `Hello` was answered; anything earlier belongs to another program's session.
     in_session: bool,
 }
@@ -176,6 +178,7 @@ impl Intake {
             tick_hz: cantap_tick_hz_before_hello(),
             disorder_ticks: u64::MAX,
             counts_losses: true,
+            has_own_clock: true,
             in_session: false,
         }
     }
@@ -202,6 +205,7 @@ impl Intake {
             tick_hz,
             disorder_ticks,
             counts_losses,
+            has_own_clock,
         } = self;
         let mut last_ticks = None;
         let mut ended = None;
@@ -257,7 +261,8 @@ impl Intake {
                     *counters = Counters::default();
                     *off_bus_since = [None; CHANNELS];
                     *lengths = BitLengths::default();
-                    if answer.capabilities & capability::ADAPTER != 0 {
+                    *has_own_clock = answer.capabilities & capability::ADAPTER == 0;
+                    if !*has_own_clock {
                         lengths.leave_out_sent();
                     }
                     *last_ns = i64::MIN;
@@ -324,7 +329,8 @@ impl Intake {
             let time_ns = self.clock.utc(at).0.max(self.last_ns);
             sorted &= time_ns >= previous;
             previous = time_ns;
-            self.records.push(TraceRecord { time_ns, device_ns: at.device_ns(self.tick_hz), channel, event });
+            let device_ns = self.has_own_clock.then(|| at.device_ns(self.tick_hz)).flatten();
+            self.records.push(TraceRecord { time_ns, device_ns, channel, event });
         }
         if !sorted {
             self.sort();

@@ -204,6 +204,8 @@ fn absurd_stamps_cost_no_frame_and_are_counted() {
         let expected: Vec<String> = (0..60).map(|number| format!("{:03X}#", 0x100 * kind + number)).collect();
         assert_eq!(frames(&records), expected);
         let now = std::time::SystemTime::UNIX_EPOCH.elapsed().unwrap().as_nanos() as i64;
+        // They have been placed in this computer's time, and are no clock of a device's any more.
+        assert!(records.iter().all(|record| record.device_ns.is_none()), "{records:?}");
         for time_ns in records.iter().filter(|record| record.frame().is_some()).map(|record| record.time_ns) {
             assert!(time_ns >= last && time_ns <= now, "{time_ns} after {last}, before {now}");
             last = time_ns;

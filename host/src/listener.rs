@@ -268,9 +268,12 @@ impl Listener {
         if !records.is_empty() && matches!(self.step, Step::Drain { .. }) {
             self.waited = Duration::ZERO;
         }
+        let is_opening = matches!(self.stage(), Stage::Greeting | Stage::Opening);
+        let first = self.records.len();
         for record in records {
             self.keep(record);
         }
+        let came = first..self.records.len();
         if let Some((at, reason)) = ended {
             self.ended_at = Some(at);
             *over = Some(reason);
@@ -290,6 +293,10 @@ impl Listener {
                 let asked = self.asked.remove(at);
                 self.answer(asked, response, now, over);
             }
+        }
+        // What a device sends that was opened otherwise than it was asked for, behind the answer that says so.
+        if is_opening && self.error.is_some() {
+            self.records.drain(came);
         }
     }
 

@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
+use cantap_emu::can::ZeroSplit;
 use cantap_emu::usb::UsbPort;
 use cantap_emu::usb_host::Timing;
 use cantap_emu::{Clock, Image, Machine, Setup, memory_map as map};
@@ -33,9 +34,14 @@ pub fn setup_for(image: &Image) -> Setup {
 /// How long a program may take to set up its clocks, in ms: a crystal and the PLL start in less than 3.
 const CLOCKS_WITHIN_MS: u64 = 50;
 
-/// The core's clock as any program for the chip sets it up, which has to be known before a machine's time has a unit: found out by running
-/// it. `None` if that is not a multiple of 12 MHz, or the program ends before.
-pub fn clock_of(image: &Image) -> Option<Clock> {
+/// For any program for the chip, which may depend on what real chips do and no manual says. `None` if the core's clock as it sets it up is not a
+/// multiple of 12 MHz, or it ends before.
+pub fn setup_for_any(image: &Image) -> Option<Setup> {
+    Some(Setup { clock: clock_of(image)?, zero_split: ZeroSplit::AllBanks, ..setup_for(image) })
+}
+
+/// The core's clock as a program sets it up, which has to be known before a machine's time has a unit: found out by running it.
+fn clock_of(image: &Image) -> Option<Clock> {
     let mut machine = Machine::new(image.clone(), setup());
     machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::new(Mutex::new(UsbPort::new(Timing::new(CLOCK)))));
     machine.run_until(CLOCK.ms(CLOCKS_WITHIN_MS)).ok()?;

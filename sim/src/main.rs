@@ -205,17 +205,19 @@ fn open(firmware: &Path) -> anyhow::Result<Image> {
 }
 
 fn usbip(args: &UsbipArgs) -> anyhow::Result<ExitCode> {
-    let (image, clock) = if args.any {
+    let (image, setup) = if args.any {
         let name = args.firmware.display();
         let bytes = std::fs::read(&args.firmware).with_context(|| format!("{name} cannot be read"))?;
         let image = Image::program(&bytes).with_context(|| name.to_string())?;
-        let clock = board::clock_of(&image);
-        let clock = clock.with_context(|| format!("{name} sets up no clock that is a multiple of 12 MHz"))?;
-        (image, clock)
+        let setup = board::setup_for_any(&image);
+        let setup = setup.with_context(|| format!("{name} sets up no clock that is a multiple of 12 MHz"))?;
+        (image, setup)
     } else {
-        (open(&args.firmware)?, CLOCK)
+        let image = open(&args.firmware)?;
+        let setup = board::setup_for(&image);
+        (image, setup)
     };
-    cantap_sim::usbip::serve(image, clock, &args.folder)?;
+    cantap_sim::usbip::serve(image, setup, &args.folder)?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::bus::Wire;
-use crate::can::MasterReset;
+use crate::can::{MasterReset, ZeroSplit};
 use crate::cpu::{Bus, Cpu, Memories, State};
 use crate::elf::Image;
 use crate::memory_map as map;
@@ -53,6 +53,8 @@ pub struct Setup {
     pub bound: Bound,
     /// What a CAN controller's master reset clears.
     pub master_reset: MasterReset,
+    /// What it means that CAN2's banks begin at 0.
+    pub zero_split: ZeroSplit,
     /// What the chip does late, wrongly or never. What is attached from outside is its owner's.
     pub hostile: Option<Hostile>,
 }
@@ -73,6 +75,7 @@ impl Setup {
             survive_failures: false,
             bound: Bound::Best,
             master_reset: MasterReset::default(),
+            zero_split: ZeroSplit::default(),
             hostile: None,
         }
     }
@@ -119,6 +122,7 @@ impl Machine {
         }
         let mut board = Board::new(&memories, setup.clock, setup.crystal);
         board.can.set_master_reset(setup.master_reset);
+        board.can.set_zero_split(setup.zero_split);
         board.receive_at(setup.receive_pins);
         if let Some(hostile) = &setup.hostile {
             board.set_hostile(hostile);

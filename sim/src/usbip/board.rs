@@ -100,9 +100,9 @@ pub struct Board {
 }
 
 impl Board {
-    /// A board with `image`, which sets up `clock` for the core, and the cable out.
-    pub fn new(image: Image, clock: Clock) -> Self {
-        let setup = Setup { clock, ..board::setup_for(&image) };
+    /// A board with `image`, and the cable out.
+    pub fn new(image: Image, setup: Setup) -> Self {
+        let clock = setup.clock;
         let mut machine = Machine::new(image, setup);
         let timing = Timing { recovery: Timing::new(clock).recovery, ..Timing::hasty(clock) };
         let port = Arc::new(Mutex::new(UsbPort::with_driver(timing, Urbs::new())));

@@ -16,7 +16,7 @@ use super::redir::{Action, Packet, Redir};
 use super::script::{self, ServerAction};
 use super::urb::Urb;
 use super::urbs::Urbs;
-use cantap_emu::Clock;
+use cantap_emu::Setup;
 use cantap_emu::elf::Image;
 
 /// How long the machine runs between two checks of the sockets.
@@ -53,10 +53,10 @@ struct Kernel {
     redir: Option<Redir>,
 }
 
-/// Serves the board to kernels on this computer, one at a time, until a line says `quit`. The program sets up `clock` for the core. The ports are written to
+/// Serves the board to kernels on this computer, one at a time, until a line says `quit`. The ports are written to
 /// `folder/ports`, as variables of a shell: USBIP for `usbip attach`, REDIR for QEMU's `usb-redir`, CONTROL for lines.
-pub fn serve(image: Image, clock: Clock, folder: &Path) -> Result<(), Error> {
-    let mut board = Board::new(image, clock);
+pub fn serve(image: Image, setup: Setup, folder: &Path) -> Result<(), Error> {
+    let mut board = Board::new(image, setup);
     let exported = Arc::new(board.look()?);
     let usbip = TcpListener::bind("127.0.0.1:0")?;
     let (redir, control) = (TcpListener::bind("127.0.0.1:0")?, TcpListener::bind("127.0.0.1:0")?);

@@ -20,9 +20,20 @@ pub struct Match {
     pub index: u8,
 }
 
+/// What CAN2SB = 0 means.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ZeroSplit {
+    /// CAN1 has no bank, as the reference manual says. Nothing of ours may depend on anything else.
+    #[default]
+    NoBank,
+    /// CAN1 has them all: firmware that clears CAN2SB and uses CAN1 (candleLight's) is in use on real chips.
+    AllBanks,
+}
+
 /// The filter registers.
 #[derive(Clone, Debug)]
 pub struct Filters {
+    pub zero_split: ZeroSplit,
     fmr: u32,
     /// FM1R: 1 is identifier list, 0 is mask.
     list: u32,
@@ -37,11 +48,17 @@ pub struct Filters {
 
 impl Default for Filters {
     fn default() -> Self {
-        Self { fmr: FMR_RESET, list: 0, wide: 0, fifo: 0, active: 0, banks: [[0; 2]; BANKS] }
+        let zero_split = ZeroSplit::default();
+        Self { zero_split, fmr: FMR_RESET, list: 0, wide: 0, fifo: 0, active: 0, banks: [[0; 2]; BANKS] }
     }
 }
 
 impl Filters {
+    /// The same chip's after a reset.
+    pub fn after_reset(&self) -> Self {
+        Self { zero_split: self.zero_split, ..Self::default() }
+    }
+
     /// Reads a register at its offset from the controller's base (0x200 to 0x31C).
     pub fn read(&self, offset: u32) -> Option<u32> {
         Some(match offset {
@@ -85,7 +102,11 @@ impl Filters {
             return None;
         }
         let split = ((self.fmr >> 8 & 0x3F) as usize).min(BANKS);
-        let banks = if controller == 0 { 0..split } else { split..BANKS };
+        let banks = match (controller, split) {
+            (0, 0) if self.zero_split == ZeroSplit::AllBanks => 0..BANKS,
+            (0, _) => 0..split,
+            _ => split..BANKS,
+        };
         let short = short_form(word);
         let mut next_index = [0u8; 2];
         let mut best: Option<(u8, Match)> = None;

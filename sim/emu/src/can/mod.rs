@@ -19,6 +19,7 @@ use crate::hostile::{Dice, Hostile};
 
 pub use controller::{BitTiming, Controller, MasterReset, Mode};
 use filter::Filters;
+pub use filter::ZeroSplit;
 pub use identifier::identifier_word;
 
 /// Registers of CAN2 begin this far above CAN1's.
@@ -52,7 +53,7 @@ impl CanPair {
     pub fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
         self.advance(now);
         if offset == MCR && value & MCR_RESET != 0 && self.controllers[0].master_reset == MasterReset::Most {
-            self.filters = Filters::default();
+            self.filters = self.filters.after_reset();
         }
         match offset {
             offset if FILTERS.contains(&offset) => self.filters.write(offset, value),
@@ -66,6 +67,11 @@ impl CanPair {
         for controller in &mut self.controllers {
             controller.master_reset = scope;
         }
+    }
+
+    /// What CAN2SB = 0 means from now on.
+    pub fn set_zero_split(&mut self, zero_split: ZeroSplit) {
+        self.filters.zero_split = zero_split;
     }
 
     /// Makes both controllers as `hostile` has them.
@@ -114,7 +120,7 @@ impl CanPair {
     pub fn reset(&mut self, n: usize) {
         self.controllers[n] = self.controllers[n].after_reset();
         if n == 0 {
-            self.filters = Filters::default();
+            self.filters = self.filters.after_reset();
         }
     }
 }

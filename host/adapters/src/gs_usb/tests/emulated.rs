@@ -36,10 +36,10 @@ impl Board {
             None
         })?);
         let image = cantap_emu::Image::program(&std::fs::read(path).unwrap()).unwrap();
-        let clock = cantap_sim::board::clock_of(&image).expect("it sets up its clocks");
+        let setup = cantap_sim::board::setup_for_any(&image).expect("it sets up its clocks");
         let folder = tempfile::tempdir().unwrap();
         let place = folder.path().to_owned();
-        let thread = std::thread::spawn(move || serve(image, clock, &place).unwrap());
+        let thread = std::thread::spawn(move || serve(image, setup, &place).unwrap());
         let mut ports: Vec<u16> = Vec::new();
         wait_until("the board does not come up", || {
             let text = std::fs::read_to_string(folder.path().join("ports")).unwrap_or_default();

@@ -37,6 +37,7 @@ FRAMES = COMMON | {
     "direction": "string",
     "dlc": "smallint",
     "data": "binary",
+    "device_ns": "bigint",
 }
 SIGNALS = COMMON | {
     "message": "string",
@@ -90,6 +91,10 @@ def rows_of(batch: pa.RecordBatch, part: str, vehicle: str, trace: str, first_ro
         "time": pc.floor_temporal(time, unit="microsecond"),
         "day": pc.floor_temporal(time, unit="day").cast(pa.timestamp("s", tz="UTC")).cast(pa.date32()),
     }
+    if "device_ns" in batch.schema.names:
+        # More than 292 years are no device's time.
+        device = batch.column("device_ns")
+        known["device_ns"] = pc.if_else(pc.less(device, pa.scalar(1 << 63, pa.uint64())), device, pa.scalar(None, pa.uint64()))
     arrays = []
     for field in STREAM_SCHEMA:
         if field.name in known:

@@ -7,6 +7,8 @@ modprobe -a vcan vxcan
 
 # bridge OPTION...: starts it in the background, as $BRIDGE, and waits until programs can use it.
 bridge() {
+  # What the one before said is no sign of this one, which may take a while to begin.
+  : > bridge.err
   "$CANTAP" bridge -d "$PORT" -b 1M "$@" > bridge.out 2> bridge.err &
   BRIDGE=$!
   wait_until grep -q "Ctrl-C ends it" bridge.err || { cat bridge.err; return 1; }

@@ -33,6 +33,7 @@ check "socketcan: what a virtual interface can tell" grep -q "kernel's, when the
 
 # Every frame that candump has.
 capture_bus -b 500k
+: > dump.txt
 candump -L -r 32000000 $BUS > dump.txt &
 CANDUMP=$!
 wait_until is_bound 2
@@ -62,6 +63,7 @@ verdict $? "socketcan: candump's times" "$(cat worst.txt) us apart at most"
 BUS=sockfd0
 iproute2 link add $BUS type vcan && iproute2 link set $BUS mtu 72 && iproute2 link set $BUS up
 capture_bus -b 500k
+: > dump.txt
 candump -L -r 32000000 $BUS > dump.txt &
 CANDUMP=$!
 wait_until is_bound 2
@@ -77,6 +79,7 @@ bare_frames capture.log > got1
 bare_frames dump.txt | sed 's/##4/##0/; s/##5/##1/; s/##6/##2/; s/##7/##3/' | cmp -s - got1 && [ "$(wc -l < got1)" = 1501 ]
 verdict $? "socketcan: cangen with CAN FD: each frame that candump has, in order" "$(grep -c '##' got1) of CAN FD among $(wc -l < got1)"
 # Sent beside a classical one, each is confirmed, and candump has it with its flags: what cansend sends of the same text.
+: > dump.txt
 candump -L $BUS > dump.txt &
 CANDUMP=$!
 wait_until is_bound 1
@@ -157,6 +160,7 @@ grep -q '^20000288#0000040000000000 20000284#0030000000000382 123#11 $' got1
 verdict $? "socketcan: error frames are errors and states" "$(cat got1)"
 
 # Sending: other programs have it, and it is confirmed.
+: > dump.txt
 candump -L $BUS > dump.txt &
 CANDUMP=$!
 wait_until is_bound 1

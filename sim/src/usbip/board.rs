@@ -3,7 +3,6 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use crate::board;
 use cantap_wire::{CHANNELS, Frame};
 
 use super::error::Error;

@@ -33,6 +33,7 @@ pub enum ZeroSplit {
 /// The filter registers.
 #[derive(Clone, Debug)]
 pub struct Filters {
+    /// What a start of CAN2's banks at 0 means.
     pub zero_split: ZeroSplit,
     fmr: u32,
     /// FM1R: 1 is identifier list, 0 is mask.
@@ -55,6 +56,7 @@ impl Default for Filters {
 
 impl Filters {
     /// The same chip's after a reset.
+    #[must_use]
     pub fn after_reset(&self) -> Self {
         Self { zero_split: self.zero_split, ..Self::default() }
     }

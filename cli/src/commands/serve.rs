@@ -32,7 +32,7 @@ use cantap_serve::{Board, BoardError, News, Role, Settings, connect};
 
 #[cfg(unix)]
 use self::doors::numbered;
-use self::doors::{Allowed, Door, TunnelArg, address, allow, allowed, loopback, tunnel};
+use self::doors::{Allowed, Door, TunnelArg, allow, allowed, loopback, tunnel};
 use self::other_doors::OtherDoors;
 use self::upkeep::Upkeep;
 use self::way::Way;
@@ -205,7 +205,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let tcp = args.tcp.as_deref().map(|text| match way {
         Way::Plain => loopback(text, PORT),
         #[cfg(feature = "tls")]
-        Way::Encrypted(_) => address(text, PORT),
+        Way::Encrypted(_) => doors::address(text, PORT),
     });
     let tcp = tcp.transpose()?;
     #[cfg(feature = "tls")]

@@ -1,6 +1,8 @@
 //! What goes on beside serving: the permissions, the audit log, and reading files again when a hang-up asks for it (SIGHUP).
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
+#[cfg(feature = "tls")]
+use std::path::PathBuf;
 use std::sync::{Arc, Weak};
 
 use anyhow::Context;
@@ -27,6 +29,7 @@ pub struct Upkeep {
 #[derive(Default)]
 struct Reread {
     boards: Vec<Weak<Board>>,
+    #[cfg(feature = "tls")]
     permissions: Option<PathBuf>,
     #[cfg(feature = "tls")]
     server: Option<Server>,
@@ -53,7 +56,11 @@ impl Upkeep {
             })
         });
         Ok(Self {
-            files: Reread { permissions: permissions.map(Path::to_owned), ..Reread::default() },
+            files: Reread {
+                #[cfg(feature = "tls")]
+                permissions: permissions.map(Path::to_owned),
+                ..Reread::default()
+            },
             audit: audit.transpose()?.map(Arc::new),
             #[cfg(unix)]
             hang_ups: hang_ups.transpose()?,

@@ -210,8 +210,9 @@ fn each_frame_arrives_in_order_and_it_drives_no_bit() {
     let (device, stamps) = board.session();
     assert_eq!((device.hello().board.as_str(), device.hello().channels), ("gs_usb", 1));
     device.listen(Channel::Can1, 500_000).unwrap();
-    // candleLight's shows a pattern with its lamps first, while it receives nothing.
-    board.wait(0.6);
+    // candleLight's shows a pattern with its lamps first, while it receives nothing: half a second, or three times that if it takes the crystal for
+    // one of 25 MHz.
+    board.wait(2.5);
     board.say("mark");
     board.say("play 1 50 mix 300");
     let mut received = Vec::new();

@@ -103,8 +103,8 @@ impl Step {
     ];
 
     /// What `cargo xtask ci` runs beside the tests: most of both waits, and what one of them does not use of the processors the other does.
-    /// Both have ended before the step that needs the computer for itself, [`Kernel`](Step::Kernel).
-    pub const BESIDE_TESTS: [Self; 2] = [Self::Python, Self::Web];
+    /// It has ended before the step that needs the computer for itself, [`Kernel`](Step::Kernel).
+    pub const BESIDE_TESTS: [Self; 1] = [Self::Python];
 
     /// What takes too long for every change, and runs weekly.
     pub const WEEKLY: [Self; 1] = [Self::Windows];

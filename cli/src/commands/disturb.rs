@@ -110,18 +110,10 @@ impl disturbance::Records for Source {
 }
 
 fn print(args: &Args, outcome: &Disturbance) -> anyhow::Result<()> {
-    let Disturbance { at_ticks, time_ns, length_ns, errors, late_ns } = outcome;
+    let Disturbance { time_ns, length_ns, errors, late_ns, .. } = outcome;
     let mut out = std::io::stdout().lock();
     if args.json {
-        let object = serde_json::json!({
-            "channel": args.channel.number(),
-            "at_ticks": at_ticks,
-            "time_s": *time_ns as f64 / 1e9,
-            "length_us": f64::from(*length_ns) / 1000.0,
-            "errors": errors,
-            "late_us": late_ns.map(|late_ns| late_ns as f64 / 1000.0),
-        });
-        writeln!(out, "{object}")?;
+        writeln!(out, "{}", outcome.json(args.channel))?;
     } else {
         let event = TraceEvent::Disturbed { length_ns: *length_ns };
         let (seconds, us) = (time_ns / 1_000_000_000, time_ns / 1000 % 1_000_000);

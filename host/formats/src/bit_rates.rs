@@ -46,8 +46,9 @@ pub(crate) fn learn_list(known: &mut BitRates, list: &str) {
     }
 }
 
-/// The side note; `None` if nothing is known.
-pub(crate) fn note(rates: &[(u8, u32)]) -> Option<String> {
+/// The side note about these channels; `None` if nothing is known.
+pub(crate) fn note(channels: &[ChannelInfo]) -> Option<String> {
+    let rates = &known(channels);
     (!rates.is_empty()).then(|| format!("{MARK}{NAME}{}", listed(rates)))
 }
 

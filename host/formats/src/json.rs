@@ -211,13 +211,12 @@ impl Decoder {
         if !self.is_frame(&fields) {
             return Ok(Line::LeftOut(NO_FRAMES));
         }
-        if self.learn(&fields)? && self.columns.len() == fields.len() {
-            let cells = self.cells(&fields);
-            let row: Vec<&[u8]> = cells.iter().map(String::as_bytes).collect();
-            self.table.first_typed_rows(std::iter::once(row.as_slice()));
-        }
+        let is_first = self.learn(&fields)? && self.columns.len() == fields.len();
         let cells = self.cells(&fields);
         let row: Vec<&[u8]> = cells.iter().map(String::as_bytes).collect();
+        if is_first {
+            self.table.first_typed_rows(std::iter::once(row.as_slice()));
+        }
         self.table.typed_row(&row, zone)
     }
 }

@@ -5,7 +5,6 @@
 mod tests;
 
 use super::analyser::{CsvLayout, TableEncoder};
-use super::bit_rates;
 use super::codec::{Decode, Encode};
 use super::csv::CsvDialect;
 use super::dif::{self, DifLayout};
@@ -42,10 +41,6 @@ pub(crate) struct FormatSpec {
 }
 
 type MakeWriter = fn(&WriteOptions) -> Box<dyn Encode>;
-
-fn trc_writer(version: TrcVersion, options: &WriteOptions) -> Box<dyn Encode> {
-    Box::new(trc::Encoder::new(version, &options.zone, bit_rates::known(&options.channels)))
-}
 
 /// The beginning of a file.
 struct Head<'a> {
@@ -136,7 +131,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| trc::is_head(head.text, head.line),
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V2_1, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_1, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V2_0),
@@ -145,7 +140,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V2_0, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V2_0, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_3),
@@ -154,7 +149,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V1_3, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_3, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_2),
@@ -163,7 +158,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V1_2, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_2, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_1),
@@ -172,7 +167,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V1_1, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_1, options))),
     },
     FormatSpec {
         format: Format::Trc(TrcVersion::V1_0),
@@ -181,7 +176,7 @@ const FORMATS: &[FormatSpec] = &[
         begins: NEVER,
         has_head: true,
         reader: |options| Box::new(trc::Decoder::new(&options.zone)),
-        writer: Some(|options| trc_writer(TrcVersion::V1_0, options)),
+        writer: Some(|options| Box::new(trc::Encoder::new(TrcVersion::V1_0, options))),
     },
     FormatSpec {
         format: Format::Csv(CsvDialect::PythonCan),

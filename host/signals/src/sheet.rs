@@ -261,10 +261,8 @@ impl Reader {
             && last.signal.name == entry.signal.name
             && last.place == entry.place
         {
-            let before = last.signal.values.iter().map(|(value, text)| (value, text.to_owned()));
-            let all: Vec<_> = before
-                .chain(entry.signal.values.iter().map(|(value, text)| (value, text.to_owned())))
-                .collect();
+            let all = last.signal.values.iter().chain(entry.signal.values.iter());
+            let all: Vec<_> = all.map(|(value, text)| (value, text.to_owned())).collect();
             last.signal.values = ValueTable::new(all);
             return;
         }

@@ -71,6 +71,21 @@ pub struct Disturbance {
     pub late_ns: Option<i64>,
 }
 
+impl Disturbance {
+    /// As an object, as `cantap disturb --json` prints it (docs/json.md).
+    pub fn json(&self, channel: Channel) -> serde_json::Value {
+        let us = |ns: f64| ns / 1000.0;
+        serde_json::json!({
+            "channel": channel.number(),
+            "at_ticks": self.at_ticks,
+            "time_s": self.time_ns as f64 / 1e9,
+            "length_us": us(f64::from(self.length_ns)),
+            "errors": self.errors,
+            "late_us": self.late_ns.map(|late_ns| us(late_ns as f64)),
+        })
+    }
+}
+
 /// Where the device's records come from: all of the channel, from before the beginning on.
 pub trait Records {
     /// Those within a time, perhaps none; `None` if it is to end.

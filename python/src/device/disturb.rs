@@ -6,7 +6,6 @@ use std::time::Duration;
 use cantap::TraceRecord;
 use cantap_work::disturbance::{self, Disturbance, Plan, When};
 use pyo3::prelude::*;
-use serde_json::json;
 
 use super::Device;
 use super::fanout::{Listener, SentFrames, Wanted};
@@ -82,17 +81,7 @@ fn disturb(
         .map_err(error)?;
         Ok(outcomes)
     })?;
-    let row = |outcome: &Disturbance| {
-        json!({
-            "channel": number.0.number(),
-            "at_ticks": outcome.at_ticks,
-            "time_s": outcome.time_ns as f64 / 1e9,
-            "length_us": f64::from(outcome.length_ns) / 1000.0,
-            "errors": outcome.errors,
-            "late_us": outcome.late_ns.map(|late_ns| late_ns as f64 / 1000.0),
-        })
-    };
-    outcomes.iter().map(|outcome| from_json(py, &row(outcome).to_string())).collect()
+    outcomes.iter().map(|outcome| from_json(py, &outcome.json(number.0).to_string())).collect()
 }
 
 /// Adds the function to the module.

@@ -28,7 +28,7 @@ pub(crate) struct Encoder {
 
 impl Encoder {
     pub(crate) fn new(options: &WriteOptions) -> Self {
-        let note = bit_rates::note(&bit_rates::known(&options.channels));
+        let note = bit_rates::note(&options.channels);
         Self { start_ns: None, seconds: Seconds::new(), zone: options.zone.clone(), note }
     }
 }

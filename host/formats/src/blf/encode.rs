@@ -60,7 +60,7 @@ impl Default for Encoder {
 
 impl Encoder {
     pub(crate) fn new(options: &WriteOptions) -> Self {
-        let note = bit_rates::note(&bit_rates::known(&options.channels));
+        let note = bit_rates::note(&options.channels);
         Self { zone: options.zone.clone(), note, ..Self::default() }
     }
 }

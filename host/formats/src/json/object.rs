@@ -1,4 +1,5 @@
-//! Objects in a text of JSON: where the next one ends, and the names and values in it.
+//! Objects in a text of JSON: where the next one ends, and the names and values in it. A general parser would round times of nanoseconds to what a
+//! float holds, and end at the first damaged byte.
 
 /// The longest object that is taken apart; a frame has some hundred bytes.
 const MOST_BYTES: usize = 256 << 10;

@@ -39,10 +39,14 @@ pub(super) struct Message<'a> {
     pub form: Form,
 }
 
-/// The identifier of a message's frames (SAE J1939-21): groups below F0 in their second byte have a destination.
+/// Whether the messages of a group have a destination: of those below F0 in their second byte (SAE J1939-21).
+pub(super) const fn is_addressed(group: u32) -> bool {
+    group >> 8 & 0xFF < 0xF0
+}
+
+/// The identifier of a message's frames.
 pub(super) fn id(priority: u32, group: u32, source: u32, destination: u32) -> Option<u32> {
-    let is_addressed = group >> 8 & 0xFF < 0xF0;
-    let is_of_bus = priority <= 7 && group <= 0x3_FFFF && !(is_addressed && group & 0xFF != 0);
-    let low = if is_addressed { destination << 8 } else { 0 };
+    let is_of_bus = priority <= 7 && group <= 0x3_FFFF && !(is_addressed(group) && group & 0xFF != 0);
+    let low = if is_addressed(group) { destination << 8 } else { 0 };
     is_of_bus.then_some(priority << 26 | group << 8 | low | source)
 }

@@ -15,7 +15,7 @@ use super::super::frame_fields::{Payload, hex_byte};
 use super::super::table;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
-use super::message::{Form, Message, Time, id};
+use super::message::{Form, Message, Time, id, is_addressed};
 use cantap_trace::Direction;
 
 /// What a sentence says.
@@ -252,10 +252,9 @@ fn mxpgn<'a>(mut cells: impl Iterator<Item = &'a [u8]>, habits: Habits) -> Optio
     if habits.last_byte_first {
         bytes.reverse();
     }
-    // Groups below F0 in their second byte have their destination in the first, if the gateway leaves it there.
-    let is_addressed = group >> 8 & 0xFF < 0xF0;
+    // The destination is in the first byte, if the gateway leaves it there.
     let (group, destination) =
-        if is_addressed && group & 0xFF != 0 { (group & !0xFF, group & 0xFF) } else { (group, 255) };
+        if is_addressed(group) && group & 0xFF != 0 { (group & !0xFF, group & 0xFF) } else { (group, 255) };
     Some(Sentence::Message(Message {
         time: Time::Unknown,
         direction: Direction::Rx,

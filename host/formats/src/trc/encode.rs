@@ -1,11 +1,12 @@
 //! Writing TRC.
 
-use super::super::bit_rates::BitRates;
+use super::super::bit_rates::{self, BitRates};
 use super::super::calendar::{Date, NS_PER_DAY, start_of_trace};
 use super::super::codec::Encode;
 use super::super::event_text;
 use super::super::left_out::LeftOut;
 use super::super::text;
+use super::super::writer::WriteOptions;
 use super::super::zone::Zone;
 use super::{BIT_RATE, EPOCH_DAY, TrcVersion, WARNING_ID, bit_rate_text, error_code, status_of};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -102,8 +103,9 @@ fn days(time_ns: i64) -> String {
 
 impl Encoder {
     /// `zone` is the zone of the file's date.
-    pub(crate) fn new(version: TrcVersion, zone: &Zone, bit_rates: BitRates) -> Self {
-        Self { version, start_ns: None, rows: 0, zone: zone.clone(), bit_rates }
+    pub(crate) fn new(version: TrcVersion, options: &WriteOptions) -> Self {
+        let bit_rates = bit_rates::known(&options.channels);
+        Self { version, start_ns: None, rows: 0, zone: options.zone.clone(), bit_rates }
     }
 
     fn head(&mut self, first_ns: i64, out: &mut Vec<u8>) -> i64 {

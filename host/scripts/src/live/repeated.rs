@@ -1,5 +1,8 @@
 //! Frames that are sent again and again: by the device where it can, or else from here.
 
+use std::time::Duration;
+
+use cantap::periodic;
 use cantap::wire::message::Periodic;
 use cantap_can::{Channel, Frame};
 
@@ -7,9 +10,6 @@ use super::repeat::Repeat;
 use super::run::LiveRun;
 use super::settings::LiveError;
 use crate::placement::{Runner, Statement};
-
-/// The shortest period that a device keeps: no frame is shorter at 1 Mbit/s.
-const SHORTEST_NS: u64 = 47_000;
 
 impl LiveRun<'_> {
     pub(super) fn repeat_of(
@@ -23,9 +23,7 @@ impl LiveRun<'_> {
         let used: Vec<u8> =
             self.slots.iter().filter(|((of, _, _), _)| *of == index).map(|(_, slot)| *slot).collect();
         let known = self.slots.get(&(index, place, handle)).copied();
-        let ticks = u128::from(period_ns) * u128::from(self.tick_hz) / 1_000_000_000;
-        // Its clock has 32 bits for a period.
-        let period_ticks = u32::try_from(ticks).ok().filter(|_| period_ns >= SHORTEST_NS);
+        let period_ticks = periodic::period_ticks(Duration::from_nanos(period_ns), self.tick_hz).ok();
         let is_of_device = period_ticks.is_some()
             && Statement::Periodic.place(self.target, used.len()).runner == Runner::Device;
         // From the last one down: whoever shares the session takes them from the first one up.

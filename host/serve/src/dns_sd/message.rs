@@ -3,6 +3,8 @@
 use std::fmt;
 use std::net::IpAddr;
 
+use super::up_to_bytes;
+
 /// The longest message, without the headers of IP and UDP (RFC 6762 §17).
 pub const MOST_BYTES: usize = 8952;
 /// The longest name, with its lengths and its end (RFC 1035 §2.3.4).
@@ -39,11 +41,19 @@ impl Name {
     pub fn of(parts: &[&str]) -> Self {
         let mut bytes = Vec::new();
         for part in parts {
-            let part = &part[..part.floor_char_boundary(MOST_LABEL)];
+            let part = up_to_bytes(part, MOST_LABEL);
             bytes.push(part.len() as u8);
             bytes.extend_from_slice(part.as_bytes());
         }
         bytes.push(0);
+        Self(bytes)
+    }
+
+    /// The name of something under this one.
+    pub fn with_first(&self, part: &str) -> Self {
+        let Self(mut bytes) = Self::of(&[part]);
+        bytes.pop();
+        bytes.extend_from_slice(&self.0);
         Self(bytes)
     }
 

@@ -43,7 +43,7 @@ pub struct Listener {
 
 /// [`SERVICE`] as it is on the wire.
 fn kind_name() -> Name {
-    Name::of(&["_cantap", "_tcp", "local"])
+    Name::of(&SERVICE.trim_end_matches('.').split('.').collect::<Vec<_>>())
 }
 
 /// What is said of each server beside its place (RFC 6763 §6).

@@ -135,7 +135,7 @@ impl Responder {
 
     fn name(&self, service: usize) -> Name {
         let label = self.services[service].0.label(" (", ")");
-        Name::of(&[&label, "_cantap", "_tcp", "local"])
+        self.kind.with_first(&label)
     }
 
     fn pointer(&self, service: usize) -> Record {

@@ -359,14 +359,9 @@ impl Columns {
             columns.places.swap(Role::Name as usize, Role::MessageName as usize);
         }
         // A table of signals, or of the messages that another sheet has the signals of.
-        let has = |role: Role| columns.places[role as usize].is_some();
-        let is_place = has(Role::StartBit) || has(Role::StartByte);
-        let is_of_signals = has(Role::Name)
-            && has(Role::Length)
-            && is_place
-            && (has(Role::MessageId) || has(Role::MessageName));
-        let is_of_messages = has(Role::MessageId) && has(Role::MessageName);
-        (is_of_signals || is_of_messages).then_some(columns)
+        let (has_id, has_name) = (columns.has(Role::MessageId), columns.has(Role::MessageName));
+        let is_of_signals = columns.are_of_signals() && (has_id || has_name);
+        (is_of_signals || has_id && has_name).then_some(columns)
     }
 
     pub fn has(&self, role: Role) -> bool {

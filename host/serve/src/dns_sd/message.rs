@@ -3,8 +3,6 @@
 use std::fmt;
 use std::net::IpAddr;
 
-use super::up_to_bytes;
-
 /// The longest message, without the headers of IP and UDP (RFC 6762 §17).
 pub const MOST_BYTES: usize = 8952;
 /// The longest name, with its lengths and its end (RFC 1035 §2.3.4).
@@ -31,6 +29,11 @@ const ANY_CLASS: u16 = 255;
 const TOP_BIT: u16 = 0x8000;
 /// The flags of an answer: it is one, and from the one who has the name.
 const ANSWER: u16 = 0x8400;
+
+/// As much of a text as has this many bytes.
+pub fn up_to_bytes(text: &str, most: usize) -> &str {
+    &text[..text.floor_char_boundary(most)]
+}
 
 /// A name, of parts as they are. Two that differ by the case of their letters are the same.
 #[derive(Clone)]

@@ -62,9 +62,5 @@ fn random(range: Range<u64>) -> u64 {
     range.start + number % (range.end - range.start)
 }
 
-fn up_to_bytes(text: &str, most: usize) -> &str {
-    &text[..text.floor_char_boundary(most)]
-}
-
 #[cfg(test)]
 mod tests;

@@ -8,8 +8,8 @@ use std::collections::VecDeque;
 use std::net::IpAddr;
 use std::time::{Duration, Instant};
 
-use super::message::{MOST_LABEL, Message, Name, Record, kind};
-use super::{random, up_to_bytes};
+use super::message::{MOST_LABEL, Message, Name, Record, kind, up_to_bytes};
+use super::random;
 
 /// For how long others may believe a record with a host in it, and any other one, in seconds (RFC 6762 §10).
 const HOST_TTL_S: u32 = 120;

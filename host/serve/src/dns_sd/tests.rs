@@ -1,7 +1,7 @@
 use super::announcing::announce_on;
 use super::browse::{browse_on, usable};
 use super::link::{Link, Speaker};
-use super::message::{MOST_BYTES, Message, Question, Record, kind};
+use super::message::{MOST_BYTES, Message, Question, Record, kind, up_to_bytes};
 use super::*;
 use std::collections::BTreeSet;
 use std::net::{IpAddr, Ipv4Addr, UdpSocket};

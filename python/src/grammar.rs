@@ -126,6 +126,15 @@ impl<'py> FromPyObject<'_, 'py> for BitRate {
 #[derive(Clone, Copy)]
 pub struct Seconds(pub f64);
 
+impl Seconds {
+    /// The time as `what`, which is not below zero.
+    pub fn duration(self, what: &str) -> Result<Duration, Error> {
+        let seconds = self.0;
+        Duration::try_from_secs_f64(seconds)
+            .map_err(|_| Error::argument(format!("{seconds} s is not a valid {what}")))
+    }
+}
+
 impl<'py> FromPyObject<'_, 'py> for Seconds {
     type Error = PyErr;
 
@@ -207,10 +216,7 @@ fn bit_rate(rate: BitRate) -> u32 {
 /// A time in seconds, not below zero.
 #[pyfunction]
 fn seconds(time: Seconds) -> PyResult<f64> {
-    let seconds = time.0;
-    Duration::try_from_secs_f64(seconds)
-        .map(|time| time.as_secs_f64())
-        .map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time")))
+    Ok(time.duration("time")?.as_secs_f64())
 }
 
 /// An identifier, and whether it has 29 bits.

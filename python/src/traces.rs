@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Duration;
 use std::{fs, io};
 
 use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
@@ -65,9 +64,7 @@ pub fn stats(
     let of_channels = |rates: &[(Option<OfTrace>, BitRate)]| {
         rates.iter().filter_map(|(channel, rate)| Some(((*channel)?.0, rate.0))).collect::<Vec<_>>()
     };
-    let window_s = window.0;
-    let window = Duration::try_from_secs_f64(window_s);
-    let window = window.map_err(|_| Error::argument(format!("{window_s} s is not a valid window length")))?;
+    let window = window.duration("window length")?;
     let statistics = Statistics::new(StatOptions {
         bitrate_bps: all(&bitrates),
         channel_bitrate_bps: of_channels(&bitrates),

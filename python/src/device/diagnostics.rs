@@ -206,7 +206,7 @@ fn ask_ecu<'py>(
     padding: Option<u8>,
 ) -> PyResult<Vec<(String, Bound<'py, PyBytes>)>> {
     let session = device.get().session()?;
-    let (p2, p2_star, patience) = (duration(times.0.0)?, duration(times.1.0)?, duration(times.2.0)?);
+    let (p2, p2_star, patience) = (duration(times.0)?, duration(times.1)?, duration(times.2)?);
     let pair = pair.parse::<Pair>().map_err(Error::argument)?;
     if data.is_empty() {
         return Err(Error::argument("a request has at least one byte, its service").into());

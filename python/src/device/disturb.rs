@@ -55,7 +55,7 @@ fn disturb(
 ) -> PyResult<Vec<Bound<'_, PyAny>>> {
     let session = device.get().session()?;
     let when = match (at, id) {
-        (Some(first), None) => When::At { first: duration(first.0)?, every: duration(every.0)? },
+        (Some(first), None) => When::At { first: duration(first)?, every: duration(every)? },
         (None, Some(id)) => When::Onto { id: id.checked(None)?, nth: nth.map(|nth| nth.0) },
         _ => return Err(Error::argument("give either at=, a time, or id=, whose frames are hit").into()),
     };

@@ -187,7 +187,7 @@ impl Device {
     /// Finds the bit rate of a closed channel's bus, in bit/s.
     fn autobaud(&self, py: Python<'_>, number: OfDevice, silence: Seconds) -> PyResult<u32> {
         let session = self.session()?;
-        let silence = duration(silence.0)?;
+        let silence = duration(silence)?;
         Ok(py.detach(|| session.find_bitrate(number.0, silence, signals))?)
     }
 
@@ -258,7 +258,7 @@ impl Device {
         let session = self.session()?;
         let frames: Vec<TraceFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.map_or(queue_timeout, |timeout| timeout.0);
-        let patience = duration(seconds)?;
+        let patience = duration(Seconds(seconds))?;
         if let (Some(_), Some(at_ns)) = (timeout, at_ns) {
             let ahead_s = at_ns.saturating_sub(utc_ns()) as f64 / 1e9;
             if ahead_s > patience.as_secs_f64() {
@@ -339,7 +339,7 @@ impl Device {
         let channel = number.0;
         let session = self.session()?;
         let frame = frame.classic("what a device repeats")?;
-        let begin = || PeriodicFrame::begin(session, channel, frame, period.0, count.0, &modifiers, node);
+        let begin = || PeriodicFrame::begin(session, channel, frame, period, count.0, &modifiers, node);
         Ok(py.detach(begin)?)
     }
 

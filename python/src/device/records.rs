@@ -49,8 +49,7 @@ impl Until {
     pub fn of(timeout: Option<Seconds>) -> Result<Self, Error> {
         let Some(Seconds(seconds)) = timeout else { return Ok(Self(None)) };
         // `max` alone would make 0 of what is not a number.
-        let time = Duration::try_from_secs_f64(if seconds < 0.0 { 0.0 } else { seconds });
-        let time = time.map_err(|_| Error::argument(format!("{seconds} s is not a valid time to wait")))?;
+        let time = Seconds(if seconds < 0.0 { 0.0 } else { seconds }).duration("time to wait")?;
         Ok(Self(Instant::now().checked_add(time)))
     }
 

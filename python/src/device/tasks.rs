@@ -2,7 +2,6 @@
 //! it.
 
 use std::sync::{Arc, Mutex, Weak};
-use std::time::Duration;
 
 use cantap::periodic::{check_modifiers, period_ticks};
 use cantap::wire::message::{
@@ -16,7 +15,7 @@ use super::session::{Session, SlotTable};
 use super::transmissions::{NOBODY, SenderId};
 use crate::error::Error;
 use crate::frame::AnyFrame;
-use crate::grammar::Identifier;
+use crate::grammar::{Identifier, Seconds};
 use crate::number::Whole;
 
 /// A modifier as it comes from Python: its kind, the byte, and two numbers or a name.
@@ -106,13 +105,12 @@ impl PeriodicFrame {
         session: Arc<Session>,
         channel: Channel,
         frame: Frame,
-        period_s: f64,
+        period: Seconds,
         count: u32,
         modifiers: &[ModifierWords],
         sender: SenderId,
     ) -> Result<Self, Error> {
-        let period = Duration::try_from_secs_f64(period_s)
-            .map_err(|_| Error::argument(format!("{period_s} s is not a valid period")))?;
+        let period = period.duration("period")?;
         let ticks = period_ticks(period, session.device()?.hello().tick_hz).map_err(Error::argument)?;
         let list = modifiers.iter().map(modifier).collect::<Result<Vec<_>, _>>()?;
         check_modifiers(&frame, &list).map_err(Error::argument)?;

@@ -2,19 +2,17 @@
 
 use std::time::Duration;
 
-use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 
 use crate::error::Error;
+use crate::grammar::Seconds;
 
 /// A frame that has not ended after this time will not end on its own.
 const MOST_TIME: Duration = Duration::from_hours(24);
 
 /// A time to wait, at most a day.
-pub fn duration(seconds: f64) -> PyResult<Duration> {
-    let time = Duration::try_from_secs_f64(seconds);
-    let time = time.map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?;
-    Ok(time.min(MOST_TIME))
+pub fn duration(time: Seconds) -> Result<Duration, Error> {
+    Ok(time.duration("time to wait")?.min(MOST_TIME))
 }
 
 /// Lets Python handle signals.

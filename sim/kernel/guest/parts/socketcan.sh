@@ -174,8 +174,9 @@ verdict $? "socketcan: frames sent are confirmed, and other programs have them" 
 [ $_code = 0 ] || cat send.txt
 
 # Down and up again, and gone.
+is_in_capture() { grep -q " $1" capture.log; }
 capture_bus -b 500k
-cansend $BUS 001#
+cansend $BUS 001# && wait_until is_in_capture 001#
 ip link set $BUS down
 wait_until has_told "taken down"
 verdict $? "socketcan: an interface that is taken down is reported, with the line for root"
@@ -184,15 +185,15 @@ wait_until has_told "the device is back after" && wait_until is_bound 1 && canse
   [ "$(bare_frames capture.log | tr '\n' ' ')" = "001# 002# " ] && grep -q '"gaps":{"count":1,' capture.json
 verdict $? "socketcan: the capture continues when it is up again, and has the gap" "$(bare_frames capture.log | tr '\n' ' ')"
 capture_bus -b 500k
-cansend $BUS 001#
-sleep 0.5
+# Once the first is in the file, the second follows just before the end.
+cansend $BUS 001# && wait_until is_in_capture 001# && cansend $BUS 002#
 iproute2 link del $BUS
 wait_until has_told "is gone"
 verdict $? "socketcan: an interface that is deleted is reported"
 kill -INT "$CAPTURE"
 wait "$CAPTURE"
-[ "$(bare_frames capture.log)" = 001# ]
-verdict $? "socketcan: what was captured before is there"
+[ "$(bare_frames capture.log | tr '\n' ' ')" = "001# 002# " ]
+verdict $? "socketcan: what was captured before is there" "$(cat capture.log capture.err)"
 
 # An interface with a bit rate: the kernel's slcan on the board.
 has_port || attach

@@ -14,9 +14,6 @@ use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathComplete
 
 use crate::shells;
 
-/// Suffixes of databases.
-const DATABASES: [&str; 7] = ["dbc", "kcd", "sym", "arxml", "toml", "xlsx", "csv"];
-
 /// Device addresses: connected boards, and devices that need none.
 pub fn devices() -> ArgValueCompleter {
     ArgValueCompleter::new(offer_devices)
@@ -154,7 +151,7 @@ fn offer_databases(current: &OsStr) -> Vec<CompletionCandidate> {
 
 fn is_database(path: &Path) -> bool {
     let suffix = path.extension().and_then(OsStr::to_str).unwrap_or_default();
-    DATABASES.iter().any(|known| suffix.eq_ignore_ascii_case(known))
+    cantap_signals::SUFFIXES.iter().any(|known| suffix.eq_ignore_ascii_case(known))
 }
 
 /// The databases named on the command line, otherwise the virtual vehicle's if it is used.

@@ -14,7 +14,7 @@ from ._native import CantapWarning, Table, is_trace_name
 TraceFile: TypeAlias = "str | os.PathLike[str] | tuple[str, Callable[[], Any]]"
 """A path, or the name of a file and a function that opens it."""
 
-DATABASE_SUFFIXES = (".dbc", ".kcd", ".sym", ".arxml", ".toml")
+DATABASE_SUFFIXES = (".dbc", ".kcd", ".sym", ".arxml", ".dbf", ".toml")
 """Files that may well lie beside the traces that they decode."""
 
 

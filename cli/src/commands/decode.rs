@@ -56,7 +56,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     if databases.is_empty() && !args.protocols {
         return Err(usage(
-            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml, .xlsx, .csv or .toml), or --protocols",
+            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml, .dbf, .xlsx, .csv or .toml), or --protocols",
         ));
     }
     let decoder = load_selected(&databases, args.read.strict, args.quiet, &args.signals)?;

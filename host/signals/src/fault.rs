@@ -18,7 +18,7 @@ pub enum DatabaseError {
     },
     /// The suffix does not belong to any kind of database.
     #[error(
-        "{file} is not a known kind of database; use a .dbc, .kcd, .sym or .arxml file, a table of signals (.xlsx, .csv), or a .toml signal file (docs/signal-file.md)"
+        "{file} is not a known kind of database; use a .dbc, .kcd, .sym, .arxml or .dbf file, a table of signals (.xlsx, .csv), or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::fault::DatabaseError;
 use super::model::Database;
-use super::{arxml, dbc, file, kcd, sheet, sym};
+use super::{arxml, dbc, dbf, file, kcd, sheet, sym};
 
 /// The kinds of database files.
 #[derive(Clone, Copy)]
@@ -13,6 +13,8 @@ pub(crate) enum FileKind {
     Kcd,
     Sym,
     Arxml,
+    /// BUSMASTER's.
+    Dbf,
     Toml,
     /// A table of signals in a text.
     Text,
@@ -28,6 +30,7 @@ impl FileKind {
             "kcd" => Ok(Self::Kcd),
             "sym" => Ok(Self::Sym),
             "arxml" => Ok(Self::Arxml),
+            "dbf" => Ok(Self::Dbf),
             "toml" => Ok(Self::Toml),
             "csv" | "tsv" => Ok(Self::Text),
             "xlsx" | "xlsm" | "xls" => Ok(Self::Workbook),
@@ -54,6 +57,7 @@ impl FileKind {
             Self::Dbc => dbc::parse(file, bytes),
             Self::Kcd => kcd::parse_bus(file, bytes, bus),
             Self::Sym => sym::parse(file, bytes),
+            Self::Dbf => dbf::parse(file, bytes),
             Self::Arxml => arxml::parse_bus(file, bytes, bus),
             Self::Toml => file::parse(file, bytes),
             Self::Text | Self::Workbook => sheet::parse(file, bytes),

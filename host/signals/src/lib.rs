@@ -15,6 +15,7 @@ mod container;
 pub mod dbc;
 mod dbc_parse;
 mod dbc_text;
+pub mod dbf;
 mod decoder;
 pub mod encode;
 mod fault;
@@ -59,7 +60,10 @@ pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, a table of signals in `.xlsx`, `.csv` or `.tsv`, or
+/// What the names of databases end with, the usual ones first.
+pub const SUFFIXES: [&str; 8] = ["dbc", "kcd", "sym", "arxml", "dbf", "toml", "xlsx", "csv"];
+
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, `.dbf`, a table of signals in `.xlsx`, `.csv` or `.tsv`, or
 /// `.toml` for cantap's own signal file. For a KCD or ARXML
 /// file with several buses, `FILE#BUS` selects one; without it, all are read as one.
 ///

@@ -109,7 +109,7 @@ fn member(file: &str, bytes: &[u8], wanted: Option<&str>) -> Result<(String, Vec
     let member = match found {
         Some(member) if wanted.is_some() || names.len() == 1 => member,
         None if wanted.is_none() => {
-            return Err(failed("it has no .dbc, .kcd, .sym or .arxml file".to_owned()));
+            return Err(failed("it has no .dbc, .kcd, .sym, .arxml or .dbf file".to_owned()));
         }
         _ => return Err(several(names)),
     };

@@ -3,6 +3,7 @@
     cantools_peer.py decode FILE...    what each signal of each database is, and $PAYLOADS random payloads, or 100, per message
     cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
     cantools_peer.py others DIR        as files, the databases of canmatrix and opendbc
+    cantools_peer.py dbf DIR DBC…      writes each, as canmatrix reads it, as DBF and as DBC, and prints both names
 
 Values are printed as text: integers of any size, floats with every digit.
 """
@@ -200,8 +201,27 @@ def fetch(directory):
         print("\n".join(sorted(str(path) for path in (files / kind).iterdir() if path.suffix.lower() == f".{kind}")))
 
 
+def as_dbf(directory, names):
+    """What canmatrix makes of DBC files: each as DBF and as DBC."""
+    canmatrix = source(pathlib.Path(directory), "canmatrix", OTHERS["canmatrix"]) / "src"
+    sys.path.insert(0, str(canmatrix))
+    import canmatrix.formats
+
+    for number, name in enumerate(names):
+        try:
+            matrix = canmatrix.formats.loadp_flat(name)
+            paths = [pathlib.Path(directory) / f"as-dbf-{number}.{suffix}" for suffix in ("dbf", "dbc")]
+            for path in paths:
+                canmatrix.formats.dumpp({"": matrix}, str(path))
+            print(*paths, sep="\t")
+        except Exception as error:  # Not every file is one for canmatrix.
+            print(f"{name}: {error}", file=sys.stderr)
+
+
 if __name__ == "__main__":
-    if sys.argv[1] == "files":
+    if sys.argv[1] == "dbf":
+        as_dbf(sys.argv[2], sys.argv[3:])
+    elif sys.argv[1] == "files":
         fetch(sys.argv[2])
     elif sys.argv[1] == "others":
         fetch_others(sys.argv[2])

@@ -52,5 +52,7 @@ impl App {
 /// Whether a file is a signal database, judging by its name, which may have a channel before it.
 fn is_database(path: &Path) -> bool {
     let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
-    ["dbc", "toml", "arxml", "kcd", "sym", "xlsx"].iter().any(|known| suffix.eq_ignore_ascii_case(known))
+    // A text with commas is a trace here.
+    let mut known = cantap_signals::SUFFIXES.iter().filter(|known| **known != "csv");
+    known.any(|known| suffix.eq_ignore_ascii_case(known))
 }

@@ -112,7 +112,7 @@ fn question(kind: PromptKind) -> &'static str {
             "go to: a time since the beginning, such as 90s, 1:30 or 1:02:03, or a share, such as 50%"
         }
         PromptKind::Open => {
-            "open: a trace, beside what runs, or a database (.dbc .toml .arxml .kcd .sym .xlsx)"
+            "open: a trace, beside what runs, or a database (.dbc .toml .arxml .kcd .sym .dbf .xlsx)"
         }
         PromptKind::Record => {
             "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, each also .gz .zst)"

@@ -3,7 +3,7 @@
 
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern};
-use cantap_signals::{Database, Decoder, Source, dbc, encode, file};
+use cantap_signals::{Database, Decoder, Source, dbc, dbf, encode, file};
 use cantap_trace::{Direction, Frame, TraceEvent, TraceRecord};
 use proptest::prelude::*;
 
@@ -162,6 +162,13 @@ proptest! {
     #[test]
     fn a_dbc_file_may_be_a_heap_of_pieces(pieces in prop::collection::vec(prop::sample::select(PIECES), 0..40)) {
         if let Ok(database) = dbc::parse("x.dbc", pieces.concat().as_bytes()) {
+            use_it(database);
+        }
+    }
+
+    #[test]
+    fn a_dbf_file_may_be_broken_anywhere(changes in prop::collection::vec(change(), 1..6)) {
+        if let Ok(database) = dbf::parse("x.dbf", &changed(super::dbf::FILE.as_bytes(), &changes)) {
             use_it(database);
         }
     }

@@ -213,11 +213,11 @@ fn peer(arguments: &[&Path], payloads: u32) -> Result<String, String> {
 }
 
 /// The script's output, or `None` after reporting that the peer is missing.
-fn peer_or_skip(arguments: &[&Path], payloads: u32) -> Option<String> {
+pub fn peer_or_skip(arguments: &[&Path], payloads: u32) -> Option<String> {
     peer(arguments, payloads).map_err(|reason| peers::skip(&format!("cantools does not run: {reason}"))).ok()
 }
 
-fn own_files() -> Vec<PathBuf> {
+pub fn own_files() -> Vec<PathBuf> {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/dbc");
     let entries = directory.read_dir().unwrap().map(|entry| entry.unwrap().path());
     let mut files: Vec<_> =

@@ -71,4 +71,8 @@ pub enum Format {
     Parquet,
     /// A JSON object for each frame.
     Json,
+    /// The table that Saleae's Logic 2 exports of its CAN analyser.
+    Saleae,
+    /// The log of CANServer, a logger for Teslas.
+    CanServer,
 }

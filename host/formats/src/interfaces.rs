@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count, and so is `CAN 1`, as programs
+/// Remembers the channel of each interface name in a file. `can0` is channel 1, as users count, and so are `CAN 1` and `CAN-1`, as programs
 /// that count so write it; a name without a number, or with a number already used by another name, gets the next free one.
 #[derive(Default, Serialize, Deserialize)]
 pub(crate) struct Interfaces {
@@ -38,7 +38,8 @@ impl Interfaces {
         }
         let digits = name.iter().rev().take_while(|byte| byte.is_ascii_digit()).count();
         let number = super::text::decimal(&name[name.len() - digits..]);
-        let counts_from_1 = name[..name.len() - digits].ends_with(b" ");
+        let stem = &name[..name.len() - digits];
+        let counts_from_1 = stem.ends_with(b" ") || stem.ends_with(b"-");
         let wanted =
             number.and_then(|number| u8::try_from(number.saturating_add(u64::from(!counts_from_1))).ok());
         let wanted = wanted.filter(|channel| *channel > 0);
@@ -66,7 +67,7 @@ mod tests {
             assert_eq!(interfaces.channel(name.as_bytes()), channel, "{name}");
         }
         let mut interfaces = Interfaces::default();
-        for (name, channel) in [("CAN 2", 2), ("CAN 1", 1), ("CAN 0", 3)] {
+        for (name, channel) in [("CAN 2", 2), ("CAN 1", 1), ("CAN 0", 3), ("USB-to-CAN V2 CAN-4", 4)] {
             assert_eq!(interfaces.channel(name.as_bytes()), channel, "{name}");
         }
         for extra in 0..1000 {

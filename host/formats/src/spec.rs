@@ -18,9 +18,9 @@ use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
-    asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, carbus,
-    crtd, csv, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog, slcan,
-    table, trc, usbcan,
+    asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, canserver,
+    carbus, crtd, csv, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog,
+    saleae, slcan, table, trc, usbcan,
 };
 
 /// One format.
@@ -466,6 +466,24 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| json::is_head(head.bytes),
         has_head: false,
         reader: |options| Box::new(json::Decoder::new(options.columns.clone())),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Saleae,
+        names: &["saleae"],
+        suffixes: &["csv"],
+        begins: |head| saleae::is_head(head.line),
+        has_head: true,
+        reader: |_| Box::new(Rows::<saleae::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::CanServer,
+        names: &["canserver"],
+        suffixes: &["cslog"],
+        begins: |head| canserver::is_head(head.bytes),
+        has_head: true,
+        reader: |_| Box::new(canserver::Decoder::default()),
         writer: None,
     },
 ];

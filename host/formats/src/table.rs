@@ -2,6 +2,7 @@
 
 mod cells;
 mod columns;
+mod kind;
 mod layout;
 mod time;
 
@@ -15,10 +16,11 @@ use super::panda::{self, REJECTED};
 use super::row_format::{Line, RowFormat};
 use super::text;
 use super::zone::Zone;
+use cantap_trace::TraceRecord;
 use cantap_trace::fd::FD_LENGTHS;
-use cantap_trace::{Direction, TraceRecord};
 use cells::{byte, direction, id, is_empty, is_list, length, mark, push_bytes};
 use columns::{Form, Role};
+use kind::Kind;
 use layout::{Layout, Separator};
 use time::FileDate;
 pub(crate) use time::date;
@@ -69,6 +71,11 @@ pub(crate) fn has_names_below(head: &[u8]) -> bool {
         |line: &[u8]| Layout::of_names(line).is_some_and(|layout| layout.place(Role::Time).is_some());
     first_lines(head).take(LINES).any(is_names)
         || memchr::memmem::find(head, b"\nLine,Abs Time(Sec),").is_some()
+}
+
+/// The cells of a line, without quotation marks and the space around them.
+pub(crate) fn split_cells(separator: u8, line: &[u8]) -> Vec<&[u8]> {
+    Separator::Byte(separator).cells(line)
 }
 
 /// How many lines may stand above the names in a table that is not known otherwise.
@@ -261,16 +268,19 @@ impl Decoder {
 
     fn line_of_cells(&mut self, layout: &Layout, cells: &[&[u8]], zone: &Zone) -> Result<Line, Fault> {
         let error = layout.place(Role::Error).and_then(|place| cells.get(place.at));
-        if error.and_then(|cell| mark(cell)) == Some(true) {
+        let kinds = layout.kinds.iter().filter_map(|(at, is_type)| Some(Kind::of(cells.get(*at)?, *is_type)));
+        let kind = kinds.fold(Kind::default(), Kind::and);
+        if error.and_then(|cell| mark(cell)) == Some(true) || kind.is_error {
             return Ok(Line::LeftOut(ERROR_FRAMES));
         }
-        self.record_of_cells(layout, cells, zone).map(Line::Record)
+        self.record_of_cells(layout, cells, kind, zone).map(Line::Record)
     }
 
     fn record_of_cells(
         &mut self,
         layout: &Layout,
         cells: &[&[u8]],
+        kind: Kind,
         zone: &Zone,
     ) -> Result<TraceRecord, Fault> {
         let is_typed = self.is_typed;
@@ -288,7 +298,7 @@ impl Decoder {
         };
         let (shown, _) = cell(Role::Id).unwrap_or_default();
         let raw = id(shown, self.radix.id)?;
-        let extended = cell(Role::Extended).and_then(|(cell, _)| mark(cell));
+        let extended = cell(Role::Extended).and_then(|(cell, _)| mark(cell)).or(kind.extended);
         let id = identifier(raw, extended.unwrap_or(raw > 0x7FF), shown)?;
         let remote = match cell(Role::Remote).map(|(cell, _)| (cell, mark(cell))) {
             // Vehicle Spy's flags of CAN FD, whose bytes go on in other columns.
@@ -298,12 +308,12 @@ impl Decoder {
                     flags,
                 ));
             }
-            Some((_, remote)) => remote.unwrap_or(false),
-            None => false,
+            Some((_, remote)) => remote.or(kind.remote).unwrap_or(false),
+            None => kind.remote.unwrap_or(false),
         };
         let direction = match cell(Role::Direction) {
             Some((way, _)) => direction(way)?,
-            None => Direction::Rx,
+            None => kind.direction.unwrap_or_default(),
         };
         let (channel, direction) = match cell(Role::Channel) {
             Some((bus, _)) if layout.is_cabana => {
@@ -320,8 +330,10 @@ impl Decoder {
         let data = if remote { Payload::EMPTY } else { self.data(layout, cells, len)? };
         let count = data.as_slice().len();
         let code = len.filter(|_| remote || count == 8).filter(|len| *len <= 15);
-        let fd = (count > 8).then(FdFields::default);
-        let len = code.map_or(count, |code| if code < 8 && !remote { count } else { code });
+        let is_fd = count > 8 || kind.fd && !remote;
+        let fd = is_fd.then_some(FdFields { brs: kind.brs, esi: kind.esi });
+        let code = code.filter(|code| !is_fd && (*code >= 8 || remote));
+        let len = code.unwrap_or(count);
         let fields = FrameFields { id, remote, direction, len: len as u8, fd };
         Ok(TraceRecord { time_ns, device_ns: None, channel, event: fields.event(&data)? })
     }

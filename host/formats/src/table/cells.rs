@@ -15,7 +15,10 @@ pub(super) fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
 
 /// A length; programs that know no whole numbers write it with a fraction.
 pub(super) fn length(cell: &[u8]) -> Result<usize, Fault> {
-    let number = text::decimal(cell.strip_suffix(b".0").unwrap_or(cell));
+    let number = match text::after_0x(cell) {
+        Some(digits) => text::hex(digits).map(u64::from),
+        None => text::decimal(cell.strip_suffix(b".0").unwrap_or(cell)),
+    };
     let len = number.filter(|len| *len <= FD_MAX_BYTES as u64);
     len.map(|len| len as usize).ok_or_else(|| Fault::malformed("a length of 0 to 64", cell))
 }

@@ -194,12 +194,20 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     if stem.len() < plain.len() && matches!(stem, "d" | "b" | "data" | "byte" | "databyte" | "db") {
         return Some((Role::Bytes, None));
     }
-    for prefix in
-        ["timestamps", "timestamp", "timeoffset", "unixtimestamp", "unixtime", "abstime", "time", "ts"]
-    {
+    for prefix in [
+        "timestamps",
+        "timestamp",
+        "timeoffset",
+        "unixtimestamp",
+        "unixtime",
+        "abstime",
+        "starttime",
+        "time",
+        "ts",
+    ] {
         if let Some(unit) = plain.strip_prefix(prefix) {
             let unit = match unit {
-                "" | "stamp" | "epoch" => None,
+                "" | "stamp" | "epoch" | "abs" => None,
                 "s" | "sec" | "secs" | "second" | "seconds" => Some("s"),
                 "ms" | "msec" | "milliseconds" => Some("ms"),
                 "us" | "usec" | "microseconds" => Some("us"),
@@ -218,11 +226,11 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     let role = match bare {
         "id" | "canid" | "arbitrationid" | "arbid" | "identifier" | "canidentifier" | "addr" | "address"
         | "messageid" | "msgid" | "frameid" | "idh" => Role::Id,
-        "dlc" | "len" | "length" | "datalength" | "datalen" | "candlc" => Role::Dlc,
+        "dlc" | "dl" | "len" | "length" | "datalength" | "datalen" | "candlc" | "control" => Role::Dlc,
         "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" => Role::Data,
         "bus" | "busid" | "busnumber" => return Some((Role::Channel, Some(Form::FromZero))),
         "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" => Role::Channel,
-        "extended" | "ide" | "ext" | "isextended" | "isextendedid" | "extendedid" | "idtype" | "type" => {
+        "extended" | "ide" | "ext" | "isextended" | "isextendedid" | "extendedid" | "idtype" => {
             Role::Extended
         }
         "remote" | "remoteedlbrsesi" | "rtr" | "isremote" | "isrtr" | "isremoteframe" => Role::Remote,
@@ -231,6 +239,17 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         _ => return None,
     };
     Some((role, radix.filter(|form| role.takes(*form))))
+}
+
+/// Whether a column of this name describes the frame of a row in words: its type (true), or one or another property of it (false).
+pub(super) fn kind_of(name: &[u8]) -> Option<bool> {
+    let letters = name.iter().filter(|byte| byte.is_ascii_alphanumeric()).map(u8::to_ascii_lowercase);
+    match letters.collect::<Vec<_>>().as_slice() {
+        b"type" | b"frametype" | b"frame" | b"format" | b"frameformat" | b"msgtype" | b"messagetype"
+        | b"eventtype" | b"kind" => Some(true),
+        b"flags" | b"flag" | b"state" => Some(false),
+        _ => None,
+    }
 }
 
 #[cfg(test)]
@@ -262,6 +281,8 @@ mod tests {
             ("Timestamp", Role::Time),
             ("time_s", Role::Time),
             ("Time (ms)", Role::Time),
+            ("Time (abs)", Role::Time),
+            ("Start Time", Role::Time),
             ("Unix Time", Role::Time),
             ("CAN ID", Role::Id),
             ("Arbitration_ID", Role::Id),
@@ -272,12 +293,11 @@ mod tests {
             ("Byte 3", Role::Bytes),
             ("DLC", Role::Dlc),
             ("Bus", Role::Channel),
-            ("Type", Role::Extended),
         ] {
             assert_eq!(role_of(name.as_bytes()).map(|(role, _)| role), Some(role), "{name}");
         }
         assert_eq!(role_of(b"Time [ms]"), Some((Role::Time, Some(Form::Unit(1_000_000)))));
-        for none in ["", "Label", "Signal1_of_ID", "Class", "D", "timer"] {
+        for none in ["", "Time (rel)", "Label", "Signal1_of_ID", "Class", "D", "timer"] {
             assert_eq!(role_of(none.as_bytes()), None, "{none}");
         }
     }

@@ -2,7 +2,7 @@
 
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
-use super::columns::{Column, Columns, Form, ROLES, Role, role_of};
+use super::columns::{Column, Columns, Form, ROLES, Role, kind_of, role_of};
 use super::columns::{TypedColumn, TypedForm};
 
 /// What separates the cells of a row.
@@ -53,6 +53,8 @@ pub(super) struct Layout {
     places: [Option<Place>; ROLES.len()],
     /// How many columns of one byte there are.
     pub byte_columns: usize,
+    /// The columns that describe the frame in words, and whether each is one of types.
+    pub kinds: Vec<(usize, bool)>,
     /// Whether there are columns that have no place in a trace.
     pub has_others: bool,
     /// Whether it is Cabana's: then buses are numbered as the panda numbers them.
@@ -83,7 +85,15 @@ impl Layout {
 
     /// No columns yet.
     const fn empty(separator: Separator) -> Self {
-        Self { separator, places: [None; ROLES.len()], byte_columns: 0, has_others: false, is_cabana: false }
+        let kinds = Vec::new();
+        Self {
+            separator,
+            places: [None; ROLES.len()],
+            byte_columns: 0,
+            kinds,
+            has_others: false,
+            is_cabana: false,
+        }
     }
 
     fn of_usual_names(separator: Separator, names: &[&[u8]]) -> Option<Self> {
@@ -102,7 +112,10 @@ impl Layout {
                 Some((role, form)) if layout.place(role).is_none() => {
                     layout.places[role as usize] = Some(Place { at, form });
                 }
-                _ => layout.has_others = true,
+                _ => match kind_of(name) {
+                    Some(is_type) => layout.kinds.push((at, is_type)),
+                    None => layout.has_others = true,
+                },
             }
         }
         layout.is_cabana = names == [&b"time"[..], b"addr", b"bus", b"data"];
@@ -195,7 +208,9 @@ impl Layout {
             first.is_some_and(|first| at >= first && at - first < self.byte_columns)
         };
         let is_other = |at: usize| self.places.iter().flatten().any(|place| place.at == at);
-        (0..columns).filter(|at| is_byte(*at) || is_other(*at)).collect()
+        (0..columns)
+            .filter(|at| is_byte(*at) || is_other(*at) || self.kinds.iter().any(|(own, _)| own == at))
+            .collect()
     }
 
     /// From a row of a table without names, if it is like those that people made of logs: see [`Self::with_length`] and [`Self::without_length`].

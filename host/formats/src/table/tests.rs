@@ -46,6 +46,54 @@ fn rows_marked_as_error_frames_are_counted_and_not_read_as_data() {
     assert_eq!(issues, Vec::<String>::new());
 }
 
+/// As programs of instruments export what they decoded: Saleae's Logic 1, PicoScope, IXXAT's MiniMon and canAnalyser, HMS's loggers, MicroPecker. What a
+/// frame is stands in words, and a remote frame is no data frame.
+#[test]
+fn words_in_a_row_say_what_its_frame_is() {
+    for (file, log) in [
+        (
+            "Time [s],Packet,Type,Identifier,Control,Data,CRC,ACK\n\
+             0.001,0,DATA,0x123,0x02,0x11 0x22,0x1A2B,ACK\n0.002,1,REMOTE,0x456,0x04,,0x0123,ACK\n\
+             0.003,2,DATA,0x18FEF100,0x01,0xAA,0x0123,NAK\n",
+            "(0.001000) can0 123#1122\n(0.002000) can0 456#R4\n(0.003000) can0 18FEF100#AA\n",
+        ),
+        (
+            "No.,ID,Frame,RTR,SRR,IDE,DLC,Data bytes,CRC Sequence,Error,Start Time,End Time\n\
+             1,123,Base Data,0,,0,2,11 22,1A2B,,-0.001,0.001\n2,00000123,Extended Data,0,1,1,1,AA,1A2B,,0.002,0.003\n",
+            "(-0.001000) can0 123#1122\n(0.002000) can0 00000123#AA\n",
+        ),
+        (
+            "ASCII Trace IXXAT MiniMon V3  Version: 1.1.4.4533\nDate: 5/9/2024\nStart time: 2:37:37 PM\nStop time: 2:37:37 PM\n\
+             Overruns:  \nBaudrate: 500 kbit/s\n\"Time\",\"Identifier (hex)\",\"Format\",\"Flags\",\"Data (hex)\"\n\
+             \"00:30:06.866\",\"184\",\"Std\",\"\",\"00 06\"\n\"00:30:06.867\",\"00000185\",\"Ext\",\"\",\"01\"\n",
+            "(1806.866000) can0 184#0006\n(1806.867000) can0 00000185#01\n",
+        ),
+        (
+            "\"Bus\";\"No\";\"Time (abs)\";\"State\";\"ID (hex)\";\"DLC\";\"Data (hex)\";\"ASCII\"\n\
+             \"USB-to-CAN V2 compact  CAN-1\";\"13\";\"00:03:03.521\";\"      \";\"67F\";\"8\";\"23 32 47 01 7B 00 00 00\";\"#2G.{...\"\n\
+             \"USB-to-CAN V2 compact  CAN-1\";\"1,014\";\"00:03:03.522\";\"      \";\"5FF\";\"1\";\"60\";\"`\"\n",
+            "(183.521000) can0 67F#233247017B000000\n(183.522000) can0 5FF#60\n",
+        ),
+        (
+            "Bus;No;Time (abs);State;ID (hex);DLC;Data (hex);ASCII\nCAN-1;1;12.345.678.000;;123;2;11 22;..\n",
+            "(12.345678) can0 123#1122\n",
+        ),
+        (
+            "FileName,a.csv\nDateTime,2024/05/06_12:34:56\nCh,1-1\nOffset,0\n\
+             Time,Ch,Protocol,Dir,Label,State,Type,Format,ID,DL,D1,D2\n0.001,1-1,CAN,R,,OK,Data Frm.,Std,123,2,11,22\n\
+             0.002,1-1,CAN,R,,OK,Remote Frm.,Ext,123,4\n0.003,1-1,CAN,R,,NG,Ack Err.,Std,124,1,11\n",
+            "(0.001000) can0 123#1122\n(0.002000) can0 00000123#R4\n",
+        ),
+        (
+            "Time\tChn\tID\tEvent Type\tDir\tDLC\tData\n0.1\tCAN 1\t123\tCAN FD Frame BRS\tRx\t2\t11 22\n",
+            "(0.100000) can0 123##11122\n",
+        ),
+    ] {
+        let (read, issues) = as_log(file);
+        assert_eq!((read.as_str(), issues), (log, Vec::<String>::new()), "{file}");
+    }
+}
+
 /// As Vehicle Spy exports them: lines about the networks, then names for each kind of network.
 #[test]
 fn vehicle_spys_rows_are_read_with_their_networks() {

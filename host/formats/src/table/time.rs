@@ -23,9 +23,26 @@ pub(super) fn number(cell: &[u8], unit_ns: i64) -> Option<i64> {
     if let Some(time_ns) = text::time_of_any_mark(cell, unit_ns) {
         return Some(time_ns);
     }
+    if let Some(time_ns) = in_groups(cell) {
+        return Some(time_ns);
+    }
     let value: f64 = std::str::from_utf8(cell).ok()?.parse().ok()?;
     let time_ns = (value * unit_ns as f64).round();
     (time_ns.abs() < 9e18).then_some(time_ns as i64)
+}
+
+/// Seconds, milliseconds, microseconds and nanoseconds, as HMS's loggers write them: `12.345.678.000`.
+fn in_groups(cell: &[u8]) -> Option<i64> {
+    let mut groups = cell.split(|byte| *byte == b'.');
+    let seconds = i64::try_from(text::decimal(groups.next()?)?).ok()?;
+    let mut rest = [0; 3];
+    for group in &mut rest {
+        let digits = groups.next().filter(|digits| digits.len() == 3)?;
+        *group = text::decimal(digits)? as i64;
+    }
+    let [ms, us, ns] = rest;
+    let time_ns = seconds.checked_mul(NS_PER_S)?.checked_add(ms * 1_000_000 + us * 1_000 + ns)?;
+    groups.next().is_none().then_some(time_ns)
 }
 
 /// A number with its unit, as MATLAB writes a duration: `1.8173 sec`.
@@ -137,6 +154,10 @@ mod tests {
             (Some(2_000_000), None, None)
         );
         assert_eq!(number(b"1.5e-3", NS_PER_S), Some(1_500_000));
+        assert_eq!(number(b"12.345.678.009", NS_PER_S), Some(12_345_678_009));
+        for bad in ["12.345.678", "1.2.3.4", "1.234.567.890.123", "99999999999.000.000.000"] {
+            assert_eq!(number(bad.as_bytes(), NS_PER_S), None, "{bad}");
+        }
         assert_eq!((unit_of(b"1614875400123456"), unit_of(b"12")), (1000, NS_PER_S));
     }
 }

@@ -260,6 +260,18 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              15,320000\t2\t00000005\t1B000067\t2\t67 00\t00000000\tg \t\r",
         ),
         text(
+            Format::Saleae,
+            "name,type,start_time,duration,identifier,num_data_bytes,data,crc,ack,remote_frame,extended\n\
+             CAN,identifier_field,-0.5,1e-05,0x123,,,,,,\nCAN,control_field,0,1e-05,,1,,,,,\nCAN,data_field,0,1e-05,,,0x11,,,,\n\
+             CAN,crc_field,0,1e-05,,,,0x1,,,\nCAN,ack_field,0,1e-05,,,,,true,,\n\
+             CAN [2],identifier_field,0.5,1e-05,0x18FEF100,,,,,,true\nCAN [2],control_field,0,1e-05,,0,,,,,\n\
+             CAN [2],crc_field,0,1e-05,,,,0x1,,,\nCAN [2],ack_field,0,1e-05,,,,,true,,\n",
+        ),
+        (
+            Format::CanServer,
+            b"CANSERVER_v2_CANSERVER\xCE\x00\x80\x2D\x0A\x24\x0A\x06\x00\xCF\x01\x00\x23\x01\x11\xAA\xCF\x02\x00\x24\x01\x00".to_vec(),
+        ),
+        text(
             Format::UsbCan,
             "序号,系统时间,时间标识,CAN通道,传输方向,ID号,帧类型,帧格式,CAN类型,长度,数据\r\n\
              0,=\"12:04:59.533\",0x592897,ch1,接收,0x0009001C,数据帧,扩展帧,CAN,0x08,x| 05 C3 8A 43 00 02 EE 00 \r\n\

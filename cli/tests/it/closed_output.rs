@@ -73,6 +73,6 @@ fn a_capture_whose_reader_went_claims_no_frame_to_have_been_taken() {
     let closed =
         "standard output was closed before the end: how many of these frames its reader took is not known";
     assert!(ended == Some(0) && told.lines().any(|line| line == closed), "{told}");
-    let (_, told) = run(1001, "capture -d virtual:load=50 -b 500k -t 100ms -o all.log", Out::Closed);
+    let (_, told) = run(1001, "capture -d virtual:load=50 -b 500k -t 100ms -o all.log --force", Out::Closed);
     assert!(told.contains("channel 1: ") && !told.contains("was closed"), "{told}");
 }

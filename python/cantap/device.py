@@ -146,7 +146,7 @@ class Device:
         """An ECU to ask, over UDS, KWP2000 or OBD-II. The channel must be open with `mode="normal"`.
 
         `request`, `response`: the identifiers, 7E0 and 7E8 if none is given; or both in one, as `"7E0:7E8"`, or `"6F1/12:612/F1"` where the first data byte is an address. The response's is 8 more, or of 29 bits (18DAxxyy) the same with both addresses exchanged,
-        unless it is given. `odx`: its description, a PDX package or ODX document (`"car.pdx"`, `"car.pdx:Engine_V2"` for one layer of it): then what it
+        unless it is given. `odx`: its description, a PDX package, ODX document or CDD (`"car.pdx"`, `"car.pdx:Engine_V2"` for one layer of it): then what it
         has can be asked by name, and its only ECU's identifiers need not be given. `to_all`: requests go to all ECUs at once. `p2`: seconds until an answer begins; `p2_star`: the same after the
         ECU has said that it is pending; `timeout`: for everything. `padding`: the byte that fills frames up; `None` keeps them short.
         """

@@ -39,7 +39,7 @@ class NegativeResponse(DeviceError):
 
 
 def load_odx(files: Odx | Path | Iterable[Path]) -> Odx:
-    """Reads descriptions of ECUs: PDX packages and ODX documents, each with a layer behind it (`car.pdx:Engine_V2`) if one is meant.
+    """Reads descriptions of ECUs: PDX packages, ODX documents and CDDs, each with a layer behind it (`car.pdx:Engine_V2`) if one is meant.
 
     What of a usable file is not evaluated is in `Odx.warnings`, and causes a `CantapWarning`.
     """

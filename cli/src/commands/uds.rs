@@ -53,7 +53,7 @@ pub struct Args {
     session: Option<u8>,
     #[command(flatten)]
     key: KeyArgs,
-    /// The ECU's description (PDX or ODX): names and values of what it is asked and answers; with a layer behind it (car.pdx:Engine_V2), that variant. Can
+    /// The ECU's description (PDX, ODX or CDD): names and values of what it is asked and answers; with a layer behind it (car.pdx:Engine_V2), that variant. Can
     /// be repeated.
     #[arg(long, value_name = "FILE[:LAYER]", global = true)]
     odx: Vec<OdxPath>,

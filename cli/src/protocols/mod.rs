@@ -29,7 +29,7 @@ pub struct ProtocolArgs {
     /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
     sheets: Vec<SheetPath>,
-    /// The description (PDX or ODX) of ECUs: names and values of what they are asked and answer. An ECU is known by its identifiers in the file;
+    /// The description (PDX, ODX or CDD) of ECUs: names and values of what they are asked and answer. An ECU is known by its identifiers in the file;
     /// with a layer behind it (car.pdx:Engine_V2), that variant of it. Can be repeated.
     #[arg(long = "odx", value_name = "FILE[:LAYER]")]
     odx: Vec<OdxPath>,

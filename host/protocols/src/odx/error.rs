@@ -43,7 +43,7 @@ pub enum OdxError {
         reason: String,
     },
     /// There is no layer in it.
-    #[error("there is no diagnostic layer in it; give the .pdx or .odx-d file of the ECU")]
+    #[error("there is no diagnostic layer in it; give the .pdx, .odx-d or .cdd file of the ECU")]
     NoLayer,
     /// Layers inherit from each other without end, or nearly so.
     #[error("its layers inherit from each other more deeply, or more, than those of any ECU")]

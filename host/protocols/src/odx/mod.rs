@@ -5,6 +5,8 @@
 //! TABLE-ENTRY, simple types, structures, fields, multiplexers, tables, trouble codes, and conversions other than programs. Programs
 //! (COMPUCODE, jobs), environment data and condensed bit masks are not evaluated, which an [`Issue`] says with its place.
 //!
+//! A CDD, Vector's CANdela description, is read into the same model.
+//!
 //! Files come from anywhere: what is unpacked, what documents expand to, how deep things contain or inherit each other, and how many
 //! values a message has are all limited.
 

@@ -12,12 +12,12 @@ pub const MOST_BYTES: u64 = 256 << 20;
 /// So many files of a package are looked at.
 const MOST_FILES: usize = 10_000;
 
-/// Whether a name is that of an ODX document: `car.odx`, `car.odx-d`, `CAR.ODX-CS`.
+/// Whether a name is that of an ODX document or of a CDD: `car.odx`, `car.odx-d`, `CAR.ODX-CS`, `car.cdd`.
 pub fn is_document(name: &str) -> bool {
     let extension = name.rsplit('/').next().and_then(|name| name.rsplit_once('.'));
     extension.is_some_and(|(_, extension)| {
         let extension = extension.to_ascii_lowercase();
-        extension == "odx" || extension.starts_with("odx-")
+        matches!(extension.as_str(), "odx" | "cdd") || extension.starts_with("odx-")
     })
 }
 
@@ -55,7 +55,7 @@ pub fn each(
     }
     if documents == 0 {
         return Err(OdxError::Package(
-            "it has no .odx document; give the PDX or ODX file of the ECU".to_owned(),
+            "it has no .odx document; give the PDX, ODX or CDD file of the ECU".to_owned(),
         ));
     }
     Ok(())

@@ -332,3 +332,51 @@ fn names_are_cleaned() {
     let text = document(&data_object(U8, ""), &service()).replace(">Read<", ">Re\u{9b}2Jad<");
     assert!(!read_text(&text).unwrap().ecu("ECU").unwrap().requests()[0].name.contains('\u{9b}'));
 }
+
+/// Vector's own kind of description, in a form made for this.
+#[test]
+fn a_cdd_is_read_like_a_document_of_odx() {
+    let odx = Odx::read("small.cdd", include_bytes!("../../tests/data/small.cdd")).unwrap();
+    let layers: Vec<_> = odx.layers().map(|(kind, name)| (kind.name(), name)).collect();
+    assert_eq!(layers, [("base-variant", "Base"), ("ecu-variant", "Sport")]);
+    let issues: Vec<_> = odx.issues.iter().map(|issue| issue.what.as_str()).collect();
+    assert_eq!(
+        issues,
+        ["a type of the kind MUXDT is not evaluated", "a service whose template is not in the file"]
+    );
+    // A variant has what its base has.
+    let ecu = odx.ecu("Sport").unwrap();
+    assert_eq!(ecu.pairs().iter().map(ToString::to_string).collect::<Vec<_>>(), ["700:708"]);
+    assert_eq!(ecu.trouble_code(0x12_3456).as_deref(), Some("Voltage too low"));
+    let names: Vec<_> = ecu.requests().into_iter().map(|request| (request.name, request.bytes)).collect();
+    let wanted = [
+        ("Codes_Read", vec![0x19]),
+        ("Supply_Read", vec![0x22, 0xF1, 0x90]),
+        ("Voltage_Read", vec![0x22, 0, 1]),
+    ];
+    assert_eq!(names, wanted.map(|(name, bytes)| (name.to_owned(), bytes)));
+    let values = |request: &[u8], response: &[u8]| {
+        let reading = ecu.describe(Some(request), Some(response)).unwrap().response.unwrap();
+        let values = reading.values.iter().filter(|decoded| !decoded.is_constant);
+        let values: Vec<_> = values.map(|one| format!("{} {:?}{}", one.path, one.value, one.unit)).collect();
+        (values, reading.undescribed, reading.stop.map(|(place, _)| place))
+    };
+    let response = [0x62, 0xF1, 0x90, 0xA0, b'a', b'b', b'c', 0xFE, 0xFF, 2, 0x11, 0x22, 0x33];
+    let (all, rest, stop) = values(&[0x22, 0xF1, 0x90], &response);
+    assert_eq!(
+        all,
+        [
+            "State Meaning(Int(0), \"off\")",
+            "Name Text(\"abc\")",
+            "Shared Int(-2)",
+            "Bytes Bytes([17, 34])",
+            "Rest Bytes([51])",
+        ]
+    );
+    assert_eq!((rest, stop), (Vec::new(), None));
+    // Twelve bits, and what a description of them leaves open.
+    let (all, ..) = values(&[0x22, 0, 1], &[0x62, 0, 1, 0x00, 0x18, 7]);
+    assert_eq!(all, ["U Real(1.0)V", "S Meaning(Int(1), \"on\")"]);
+    let (_, _, stop) = values(&[0x19], &[0x59, 1, 2, 3]);
+    assert!(stop.is_some());
+}

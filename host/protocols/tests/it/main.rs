@@ -1,6 +1,7 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
 mod anything_is_taken;
+mod cdd_agrees_with_cantools;
 mod odx_agrees_with_odxtools;
 mod protocols_agree_with_peers;
 mod protocols_agree_with_tshark;

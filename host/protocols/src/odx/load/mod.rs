@@ -1,5 +1,6 @@
 //! From XML to the model: documents one after another, then what they refer to.
 
+mod cdd;
 mod dops;
 mod layers;
 mod params;
@@ -63,6 +64,10 @@ impl Loader {
         self.lines.clear();
         self.lines.extend((0..).zip(text.bytes()).filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at));
         let root = document.root_element();
+        if root.tag_name().name() == "CANDELA" {
+            self.candela(root);
+            return Ok(());
+        }
         if root.tag_name().name() != "ODX" {
             // The package's index, or another kind of file.
             self.issue(root, format!("a document of {}, not of ODX", root.tag_name().name()));

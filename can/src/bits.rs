@@ -231,6 +231,8 @@ mod tests {
         let bits = FrameBits::of(&frame("000#55"));
         assert_eq!(bits, FrameBits { unstuffed: 55, stuff: 3, crc: 0x722 });
         assert_eq!(bits.duration_ns(1_000_000), 58_000);
+        // Rounded down; no bit rate divides by zero.
+        assert_eq!((bits.duration_ns(83_333), bits.duration_ns(0)), (696_002, 58_000_000_000));
     }
 
     #[test]

@@ -36,3 +36,18 @@ impl Channel {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn users_count_from_one_and_tables_from_zero() {
+        assert_eq!(Channel::ALL.map(Channel::number), [1, 2]);
+        assert_eq!(Channel::ALL.map(Channel::index), [0, 1]);
+        assert_eq!(
+            [0, 1, 2, 3].map(Channel::from_number),
+            [None, Some(Channel::Can1), Some(Channel::Can2), None]
+        );
+    }
+}

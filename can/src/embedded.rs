@@ -101,4 +101,20 @@ mod tests {
         let long = Frame::from_bus(Id::standard_truncated(1), false, 15, [7; 8]);
         assert_eq!((can::Frame::dlc(&long), can::Frame::data(&long)), (8, &[7; 8][..]));
     }
+
+    #[test]
+    fn every_error_of_the_bus_has_its_kind_there() {
+        use can::{
+            Error,
+            ErrorKind::{Acknowledge, Bit, Crc, Form, Stuff},
+        };
+        assert_eq!(BusErrorKind::ALL.map(|kind| kind.kind()), [Stuff, Form, Acknowledge, Bit, Bit, Crc]);
+    }
+
+    #[test]
+    fn a_remote_frame_asks_for_up_to_eight_bytes() {
+        let lengths =
+            [0, 8, 9, 256, 264].map(|dlc| <Frame as can::Frame>::new_remote(can::StandardId::ZERO, dlc));
+        assert_eq!(lengths.map(|frame| frame.map(|frame| frame.dlc())), [Some(0), Some(8), None, None, None]);
+    }
 }

@@ -123,4 +123,28 @@ mod tests {
             }));
         }
     }
+
+    #[test]
+    fn a_frame_has_the_parts_that_it_was_made_of_and_shows_them() {
+        let id = Id::standard(0x123).unwrap();
+        for (brs, esi, text) in [
+            (false, false, "123##0DEADBEEF"),
+            (true, false, "123##1DEADBEEF"),
+            (false, true, "123##2DEADBEEF"),
+            (true, true, "123##3DEADBEEF"),
+        ] {
+            let frame = FdFrame::new(id, brs, esi, &[0xDE, 0xAD, 0xBE, 0xEF]).unwrap();
+            assert_eq!((frame.id(), frame.brs(), frame.esi(), frame.dlc()), (id, brs, esi, 4));
+            assert_eq!(
+                (frame.to_string().as_str(), format!("{frame:?}")),
+                (text, format!("FdFrame({text})"))
+            );
+            assert_eq!(frame.identifier_frame(), "123#".parse().unwrap());
+        }
+        let long = FdFrame::new(Id::extended(0x123).unwrap(), false, false, &[0; 64]).unwrap();
+        assert_eq!(
+            (long.dlc(), long.data_len(), long.identifier_frame()),
+            (15, 64, "00000123#".parse().unwrap())
+        );
+    }
 }

@@ -326,4 +326,79 @@ mod tests {
         assert_eq!((frame.dlc(), frame.data()), (15, &[7; 8][..]));
         assert_eq!(Frame::from_bus(id, true, 15, [7; 8]).data(), &[] as &[u8]);
     }
+
+    #[test]
+    fn an_identifier_is_one_of_eleven_or_of_twenty_nine_bits() {
+        assert_eq!(Id::standard(0x7FF).map(|id| (id.raw(), id.is_extended())), Some((0x7FF, false)));
+        assert_eq!(
+            Id::extended(0x1FFF_FFFF).map(|id| (id.raw(), id.is_extended())),
+            Some((0x1FFF_FFFF, true))
+        );
+        assert_eq!((Id::standard(0x800), Id::extended(0x2000_0000)), (None, None));
+        // The same number is another identifier.
+        assert_ne!(Id::standard(1), Id::extended(1));
+        // Registers may hold more than the identifier.
+        assert_eq!(Id::standard_truncated(0xFFFF_FFFF), Id::standard(0x7FF).unwrap());
+        assert_eq!(Id::extended_truncated(0xFFFF_FFFF), Id::extended(0x1FFF_FFFF).unwrap());
+        assert_eq!(
+            format!("{:?} {:?}", Id::standard(0x12).unwrap(), Id::extended(0x12).unwrap()),
+            "Id(012) Id(00000012)"
+        );
+        assert_eq!((Id::MAX_STANDARD, Id::MAX_EXTENDED), (0x7FF, 0x1FFF_FFFF));
+    }
+
+    #[test]
+    fn bytes_beyond_the_length_are_not_part_of_a_frame() {
+        let id = Id::standard(1).unwrap();
+        let all = [1, 2, 3, 4, 5, 6, 7, 8];
+        for dlc in 0..=8_u8 {
+            let frame = Frame::from_bus(id, false, dlc, all);
+            assert_eq!(frame.data(), &all[..usize::from(dlc)]);
+            assert_eq!(frame.padded_data()[usize::from(dlc)..], [0; 8][usize::from(dlc)..]);
+            assert_eq!(Some(frame), Frame::data_frame(id, &all[..usize::from(dlc)]));
+            assert_eq!(frame, Frame::from_clean_parts(id, false, dlc, frame.padded_data()));
+        }
+        // Of a register, four bits are the code.
+        assert_eq!(Frame::from_bus(id, false, 0xF3, all), Frame::from_bus(id, false, 3, all));
+        assert_eq!(Frame::data_frame(id, &[0; 9]), None);
+        let remote = Frame::remote_frame(id, 15).unwrap();
+        assert_eq!(
+            (remote.is_remote(), remote.dlc(), remote.data_len(), remote.data()),
+            (true, 15, 0, &[] as &[u8])
+        );
+        assert_eq!(Frame::remote_frame(id, 16), None);
+        assert_eq!(format!("{remote:?}"), "Frame(001#R8_F)");
+    }
+
+    #[test]
+    fn lengths_after_an_r_and_raw_ones_are_those_of_can_utils() {
+        let parse = |text: &str| text.parse::<Frame>().map(|frame| frame.to_string());
+        for text in ["123#R8", "123#R1", "123#R8_9", "123#1122334455667788_F", "123#1122334455667788_A"] {
+            assert_eq!(parse(text), Ok(text.to_owned()));
+        }
+        assert_eq!(parse("123#r8_a"), Ok("123#R8_A".to_owned()));
+        assert_eq!(parse("123#R0"), Ok("123#R".to_owned()));
+        for text in
+            ["123#R7_9", "123#R_9", "123#R8_8", "123#R12", "123#1122334455667788_8", "123#1122334455667788_G"]
+        {
+            assert_eq!(parse(text), Err(ParseFrameError::BadDlc), "{text}");
+        }
+        assert_eq!(parse("123#11..22"), Err(ParseFrameError::BadData));
+        assert_eq!(parse("123#1G"), Err(ParseFrameError::BadData));
+    }
+
+    /// Each says what to write instead.
+    #[test]
+    fn every_fault_has_its_own_words() {
+        use ParseFrameError::{BadData, BadDlc, BadId, MissingHash, TooLong};
+        for (fault, words) in [
+            (MissingHash, "123#DEADBEEF"),
+            (BadId, "3 hexadecimal digits"),
+            (BadData, "pairs of hexadecimal digits"),
+            (TooLong, "at most 8 data bytes"),
+            (BadDlc, "0 to 8"),
+        ] {
+            assert!(fault.to_string().contains(words), "{fault}");
+        }
+    }
 }

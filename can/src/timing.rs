@@ -240,4 +240,84 @@ mod tests {
         );
         assert_eq!(BitTiming::choose(CLOCK, 1_000_001, None), Err(NoTiming::OutOfRange));
     }
+
+    #[test]
+    fn only_what_a_controller_can_be_set_to_is_valid() {
+        let timing = |prescaler, segment1, segment2, jump_width| {
+            BitTiming { prescaler, segment1, segment2, jump_width }.is_valid()
+        };
+        assert!(timing(1, 1, 1, 1) && timing(1024, 16, 8, 4) && timing(1, 1, 2, 2));
+        for (prescaler, segment1, segment2, jump_width) in [
+            (0, 1, 1, 1),
+            (1025, 1, 1, 1),
+            (1, 0, 1, 1),
+            (1, 17, 1, 1),
+            (1, 1, 0, 1),
+            (1, 1, 9, 1),
+            (1, 1, 1, 0),
+            (1, 1, 8, 5),
+            // The jump would be longer than the segment that it shortens.
+            (1, 1, 1, 2),
+        ] {
+            assert!(
+                !timing(prescaler, segment1, segment2, jump_width),
+                "{prescaler} {segment1} {segment2} {jump_width}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_timing_says_how_long_its_bit_is_and_where_it_is_sampled() {
+        let timing = BitTiming { prescaler: 9, segment1: 13, segment2: 2, jump_width: 2 };
+        assert_eq!((timing.quanta(), timing.clocks_per_bit(), timing.bitrate_bps(CLOCK)), (16, 144, 250_000));
+        assert_eq!(timing.sample_point_permille(), 875);
+        let rates = [1_000_000, 800_001, 800_000, 500_001, 500_000, 5_000];
+        assert_eq!(rates.map(BitTiming::recommended_sample_point_permille), [750, 750, 800, 800, 875, 875]);
+    }
+
+    #[test]
+    fn the_wanted_sample_point_is_met_as_nearly_as_the_clock_allows() {
+        let point = |wanted| BitTiming::choose(CLOCK, 500_000, Some(wanted)).unwrap().sample_point_permille();
+        assert_eq!([500, 600, 700, 750, 800, 875].map(point), [500, 611, 708, 750, 777, 875]);
+    }
+
+    /// For a search, which tries them all.
+    #[test]
+    fn every_way_to_a_rate_is_listed_once_from_the_most_quanta_down() {
+        let all: Vec<BitTiming> = BitTiming::all(CLOCK, 500_000).collect();
+        assert!(all.iter().all(|timing| timing.is_valid() && timing.bitrate_bps(CLOCK) == 500_000));
+        assert!(all.iter().all(|timing| timing.jump_width == timing.segment2.min(4)));
+        assert!(all.is_sorted_by(|a, b| (b.quanta(), a.segment2) < (a.quanta(), b.segment2)));
+        // 72 clocks: 24, 18, 12, 9, 8, 6, 4 and 3 quanta.
+        let by_hand = |clocks: u32| {
+            let ways = (1..=16).flat_map(|one| (1..=8).map(move |two| 1 + one + two));
+            ways.filter(|quanta| clocks % quanta == 0 && (1..=1024).contains(&(clocks / quanta))).count()
+        };
+        assert_eq!(all.len(), by_hand(72));
+        for clocks in [0, 1, 2, 3, 25, 26, 3 * 1024, 3 * 1025, 25 * 1024, 25 * 1024 + 1] {
+            assert_eq!(BitTiming::of_clocks(clocks).count(), by_hand(clocks), "{clocks}");
+        }
+        assert_eq!((BitTiming::all(CLOCK, 0).count(), BitTiming::all(0, 500_000).count()), (0, 0));
+        // No whole number of clocks, but rounded, up or down, it is the rate.
+        assert!(BitTiming::all(CLOCK, 734_694).all(|timing| timing.clocks_per_bit() == 49));
+        assert!(BitTiming::all(CLOCK, 734_694).count() > 0 && BitTiming::all(CLOCK, 734_693).count() == 0);
+        assert!(BitTiming::all(CLOCK, 83_333).count() > 0 && BitTiming::all(CLOCK, 83_334).count() == 0);
+    }
+
+    #[test]
+    fn what_is_near_an_unreachable_rate_is_said_as_far_as_there_is_something() {
+        let words = |clock, rate| BitTiming::choose(clock, rate, None).unwrap_err().to_string();
+        assert_eq!(
+            words(2_999_997, 999_998),
+            "the clock cannot be divided to it; the nearest rates are 749999 and 999999 bit/s"
+        );
+        assert_eq!(
+            words(2_999_997, 1_000_000),
+            "the clock cannot be divided to it; the nearest rate is 999999 bit/s"
+        );
+        assert_eq!(
+            words(400_000_000, 5_000),
+            "the clock cannot be divided to it; the nearest rate is 15625 bit/s"
+        );
+    }
 }

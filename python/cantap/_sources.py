@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import posixpath
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -83,9 +84,9 @@ def _of_url(url: str) -> Iterator[TraceFile]:
     system, path = file_system(url)
     # A name may have brackets itself.
     if glob.has_magic(path) and not system.exists(path):
-        names = _files_among(system, system.glob(path, detail=True).values())
+        names = _files_matching(system, path)
     elif system.isdir(path):
-        names = [*own_file(system, path), *_traces(url, _files_among(system, system.ls(path, detail=True)))]
+        names = [*own_file(system, path), *_traces(url, _objects(system.ls(path, detail=True)))]
     else:
         names = [path]
     if not names:
@@ -94,32 +95,40 @@ def _of_url(url: str) -> Iterator[TraceFile]:
         yield opener(system, name)
 
 
-def _files_among(system: Any, entries: Iterable[Any]) -> list[str]:
-    """The names of the files in a listing. In an object store a name may be a file's and a folder's: `a.blf` beside `a.blf/b.blf`."""
-    found: dict[str, bool] = {}
-    for entry in entries:
-        found[entry["name"]] = found.get(entry["name"], False) or entry["type"] == "file"
-    # Of such a name a pattern's listing may have the folder alone.
-    return [name for name, is_file in found.items() if is_file or is_trace_name(name) and _has_content(system, name)]
+def _files_matching(system: Any, pattern: str) -> list[str]:
+    """The files whose names a pattern fits. In an object store a name may be a file's and a folder's, `a.blf` beside `a.blf/b.blf`, and of such a name
+    the answer has the folder alone: the listing that it is in has both."""
+    found = {name: entry["type"] for name, entry in system.glob(pattern, detail=True).items()}
+    folders = {name for name, kind in found.items() if kind == "directory"}
+    above = {posixpath.dirname(name) for name in folders} - {""}
+    both = {entry["name"] for folder in above for entry in system.ls(folder, detail=True) if entry["type"] == "file"}
+    return [name for name, kind in found.items() if kind == "file" or name in both]
 
 
-def own_file(system: Any, path: str) -> list[str]:
+def _objects(entries: Iterable[Any]) -> list[str]:
+    """The names of the files in a listing, without what some programs make of an empty folder: an empty object whose name ends like a folder's."""
+    return [entry["name"] for entry in entries if entry["type"] == "file" and not (entry["name"].endswith("/") and not entry["size"])]
+
+
+def own_file(system: Any, folder: str) -> list[str]:
     """A folder's name, if it is a file's, too."""
-    return [path] if is_trace_name(path) and _has_content(system, path) else []
-
-
-def _has_content(system: Any, name: str) -> bool:
+    # What is known of it from a listing may be the folder alone.
+    system.invalidate_cache(folder)
     try:
-        with system.open(name, "rb") as file:
-            file.read(1)
+        about = system.info(folder)
     except OSError:
-        return False
-    return True
+        return []
+    # Without content it is what some programs make of a folder.
+    return [folder] if about["type"] == "file" and (about["size"] or is_trace_name(folder)) else []
 
 
 def opener(system: Any, name: str) -> tuple[str, Callable[[], Any]]:
     """A file of a file system of fsspec: what it is called, and what opens it."""
-    return system.unstrip_protocol(name), _Opener(system, name)
+    return _url(system, name), _Opener(system, name)
+
+
+def _url(system: Any, name: str) -> str:
+    return str(system.unstrip_protocol(name)).rstrip("/") + "/" * name.endswith("/")
 
 
 def is_url(path: Any) -> bool:
@@ -134,11 +143,19 @@ class _Opener:
         self._system, self._name = system, name
 
     def __call__(self) -> Any:
+        if self._name.endswith("/"):
+            raise OSError(f"{_url(self._system, self._name)}: a name that ends like a folder's cannot be opened; copy it to another")
+        # A listing says of `a` beside `a/b` that it is a folder, which would be read as empty; and what it says of a file may be of an older one.
+        self._system.invalidate_cache(self._name)
         try:
-            return self._system.open(self._name, "rb", block_size=8 << 20, cache_type="readahead")
+            file = self._system.open(self._name, "rb", block_size=8 << 20, cache_type="readahead")
         except FileNotFoundError as error:
             # A store's own words do not say which.
-            raise FileNotFoundError(f"{self._system.unstrip_protocol(self._name)}: {error}") from error
+            raise FileNotFoundError(f"{_url(self._system, self._name)} does not exist: {error}") from error
+        # Of a file that is gone, whose name others begin with, only the folder is left.
+        if (getattr(file, "details", None) or {}).get("type") == "directory":
+            raise FileNotFoundError(f"{_url(self._system, self._name)} does not exist, only what is below it")
+        return file
 
 
 class _Borrowed:
@@ -161,7 +178,7 @@ def _traces(folder: str, names: list[str]) -> list[str]:
     visible = [name for name in names if not os.path.basename(name).startswith(".")]
     found = [name for name in visible if is_trace_name(name)]
     others = sorted(set(visible) - set(found))
-    others = [os.path.basename(name) for name in others if not name.lower().endswith(DATABASE_SUFFIXES)]
+    others = [os.path.basename(name) or name for name in others if not name.lower().endswith(DATABASE_SUFFIXES)]
     if others:
         shown = ", ".join(others[:3]) + (", …" if len(others) > 3 else "")
         warnings.warn(f"{folder}: {len(others)} files without the name of a trace were left out: {shown}", CantapWarning, stacklevel=2)

@@ -95,18 +95,21 @@ def test_what_has_come_since_the_last_listing_is_listed(odd):
 def test_what_vanishes_between_listing_and_reading_is_said(odd, store, tmp_path, monkeypatch):
     for number in range(3):
         odd(f"v/{number}.log", frame(number))
+    # What is gone may have been a folder's name, too.
+    odd("v/2.log/below.log", frame(3))
     from cantap.lake import inputs
 
     fetch = inputs.Trace.fetch
 
     def late(trace, folder):
-        if trace.name.endswith("/1.log"):
-            store.delete_object("odd", "v/1.log")
+        if trace.name.endswith(("/1.log", "/2.log")):
+            store.delete_object("odd", trace.name.removeprefix("s3://odd/"))
         return fetch(trace, folder)
 
     monkeypatch.setattr(inputs.Trace, "fetch", late)
     summary = ingest("s3://odd", tmp_path / "lake", workers=1)
-    assert dict(summary.states) == {"read": 2, "failed": 1} and "exist" in summary.problems["s3://odd/v/1.log"]
+    assert dict(summary.states) == {"read": 2, "failed": 2}
+    assert all("does not exist" in summary.problems[f"s3://odd/v/{number}.log"] for number in (1, 2))
     # Nothing of it is in the ledger: it is tried again if it comes back.
     odd("v/1.log", frame(1))
     monkeypatch.undo()
@@ -121,3 +124,63 @@ def test_one_of_several_that_is_gone_ends_the_reading(odd, store):
     with pytest.raises(OSError):
         for _ in scan:
             pass
+
+
+#: Each of the names with content is a trace, though another one begins with it and a slash.
+BOTH = ["a", "a/b.log", "v/c.log", "v/c.log/d.log", "v/c.log/d.log/e", "w/f", "w/f/g/h.log"]
+
+
+def test_a_name_that_others_begin_with_is_a_trace_of_its_own(odd, tmp_path):
+    for number, key in enumerate(BOTH):
+        odd(key, frame(number))
+    # Markers of folders, as different programs make them.
+    odd("v/", b"")
+    odd("w", b"")
+    found = {f"s3://odd/{key}": number for number, key in enumerate(BOTH)}
+    for source, below in (("s3://odd", ""), ("s3://odd/v", "v/"), ("s3://odd/w", "w/"), ("s3://odd/v/c.log", "v/c.log"), ("s3://odd/a", "a")):
+        lake = tmp_path / f"lake {below.replace('/', '-')}"
+        wanted = {name: number for name, number in found.items() if name.startswith(f"s3://odd/{below}")}
+        summary = ingest(source, lake, workers=2)
+        assert dict(summary.states) == {"read": len(wanted)}, (source, summary.problems)
+        rows = Store(lake).dataset("frames").to_table().to_pylist()
+        assert {row["trace"]: row["data"][1] for row in rows} == wanted, source
+
+
+def test_a_name_that_others_begin_with_is_read_by_itself_by_a_pattern_and_with_its_folder(odd):
+    for number, key in enumerate(BOTH):
+        odd(key, frame(number))
+    read = lambda source: [row.data[1] for row in cantap.read(source)]
+    assert read("s3://odd/v/c.log") == [2, 3] and read(["s3://odd/v/c.log/d.log/e"]) == [4]
+    # Also after a listing, which says of it that it is a folder.
+    for _ in range(2):
+        assert read("s3://odd/*/c.*") == [2] and read("s3://odd/?/f") == [5] and read("s3://odd/v/**/*.log") == [2, 3]
+        assert read("s3://odd/v") == [2] and read("s3://odd/w/f") == [5]
+
+
+def test_what_is_empty_and_what_cannot_be_opened_by_its_name_is_accounted_for(odd, tmp_path):
+    odd("v/empty.log", b"")
+    odd("v/folder/", b"")
+    odd("v/content.log/", frame(1))
+    odd("v/full/", frame(2))
+    odd("v/full/1.log", frame(3))
+    summary = ingest("s3://odd", tmp_path / "lake", workers=1)
+    assert dict(summary.states) == {"empty": 1, "read": 1, "failed": 2}
+    assert all("ends like a folder's" in summary.problems[f"s3://odd/v/{name}/"] for name in ("content.log", "full"))
+    with pytest.warns(cantap.CantapWarning, match="full/"):
+        assert [row.data[1] for row in cantap.read("s3://odd/v/full")] == [3]
+    assert len(cantap.read("s3://odd/v/empty.log")) == 0
+
+
+def test_what_has_grown_since_it_was_listed_is_read_to_its_end(odd, tmp_path, monkeypatch):
+    odd("v/0.log", frame(0))
+    from cantap.lake import inputs
+
+    fetch = inputs.Trace.fetch
+
+    def late(trace, folder):
+        odd("v/0.log", frame(0) + frame(1))
+        return fetch(trace, folder)
+
+    monkeypatch.setattr(inputs.Trace, "fetch", late)
+    ingest("s3://odd", tmp_path / "lake", workers=1)
+    assert len(Store(tmp_path / "lake").dataset("frames").to_table()) == 2

@@ -253,4 +253,44 @@ mod tests {
         let mut decoded = [0; MAX_ENCODED];
         assert_eq!(unseal(&out[..len - 1], &mut decoded).unwrap(), &[0xAA; MAX_MESSAGE]);
     }
+
+    #[test]
+    fn what_does_not_fit_is_refused_and_what_just_fits_is_not() {
+        let sealed = |room: usize, out: usize| seal(&mut vec![0xAA; room], 300, &mut vec![0; out]);
+        // 304 bytes with the CRC, of which 254 fill one run: two bytes of COBS, and the zero.
+        assert_eq!((max_encoded_len(300), sealed(304, 307)), (307, Some(307)));
+        assert_eq!((sealed(303, 307), sealed(304, 306), sealed(299, 307)), (None, None, None));
+        assert_eq!((max_encoded_len(0), max_encoded_len(250), max_encoded_len(251)), (6, 256, 258));
+        let encoded =
+            |buffer: usize, out: usize| encode(&[7_u8; 20], &mut vec![0; buffer], &mut vec![0; out]);
+        assert_eq!(
+            (encoded(24, 26), encoded(23, 26), encoded(24, 25), encoded(3, 26)),
+            (Some(26), None, None, None)
+        );
+    }
+
+    #[test]
+    fn what_is_not_a_message_is_said_by_its_kind() {
+        let read = |bytes: &[u8], room: usize| unseal(bytes, &mut vec![0; room]).map(<[u8]>::to_vec);
+        let mut out = [0; 32];
+        let len = seal(&mut [1, 0, 2, 0, 0, 0, 0], 3, &mut out).unwrap() - 1;
+        assert_eq!(read(&out[..len], len), Ok(vec![1, 0, 2]));
+        assert_eq!(read(&out[..len], len - 1), Err(FramingError::Cobs));
+        assert_eq!(read(&out[..len - 1], 32), Err(FramingError::Cobs));
+        assert_eq!(read(&[4, 1, 2, 3], 32), Err(FramingError::Short));
+        let mut damaged = out;
+        damaged[1] ^= 2;
+        assert_eq!(read(&damaged[..len], 32), Err(FramingError::Crc));
+        // A message may be empty: then only its CRC is there.
+        let len = seal(&mut [0; 4], 0, &mut out).unwrap() - 1;
+        assert_eq!(read(&out[..len], 32), Ok(Vec::new()));
+        let words =
+            [FramingError::Cobs, FramingError::Short, FramingError::Crc].map(|error| error.to_string());
+        assert_eq!(words, ["not COBS", "shorter than a CRC", "the CRC does not match"]);
+    }
+
+    #[test]
+    fn a_checksum_of_bytes_one_by_one_is_that_of_all() {
+        assert_eq!((crc32(b"123456789"), checksum(b"123456789".iter().copied())), (0xCBF4_3926, 0xCBF4_3926));
+    }
 }

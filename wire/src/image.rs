@@ -232,4 +232,33 @@ mod tests {
         assert_eq!(read(&[&whole[..], &whole[..]].concat()), Err(ImageFault::Unknown));
         assert_eq!(read(&bytes(&ImageInfo::new("x", [0; 3]))), Err(ImageFault::Unfinished));
     }
+
+    /// The person who updates a board sees these.
+    #[test]
+    fn every_fault_says_what_to_do() {
+        for (fault, words) in [
+            (ImageFault::Unknown, "not a firmware of cantap"),
+            (ImageFault::OtherLayout, "update the command first"),
+            (ImageFault::Unfinished, "cargo xtask dist"),
+            (ImageFault::Length { found: 9, expected: 10 }, "only 9 of its 10 bytes"),
+            (ImageFault::Length { found: 11, expected: 10 }, "11 bytes instead of 10"),
+            (ImageFault::Damaged, "fetch it again"),
+        ] {
+            assert!(fault.to_string().contains(words), "{fault}");
+        }
+    }
+
+    #[test]
+    fn a_name_that_fills_its_field_and_an_image_that_ends_with_its_information_are_read() {
+        let name = "a-board-of-twenty-four-b";
+        let mut image = bytes(&ImageInfo::new(name, [1, 0, 0x1234]));
+        finish(&mut image).unwrap();
+        assert_eq!(read(&image).map(|image| (image.board, image.version)), Ok((name, [1, 0, 0x1234])));
+        let mut later = image.clone();
+        later[LAYOUT_AT] = 2;
+        assert_eq!(
+            (read(&later), read(&image[1..])),
+            (Err(ImageFault::OtherLayout), Err(ImageFault::Unknown))
+        );
+    }
 }

@@ -409,4 +409,32 @@ mod tests {
         assert_eq!(len, MAX_RECORD);
         assert_eq!(decode(&out), Ok((Record::Event(event), i64::MIN, &[][..])));
     }
+
+    /// Records of a loaded bus are a few hundred ticks apart, and one of the other channel may be a little earlier.
+    #[test]
+    fn differences_of_every_length_round_trip_with_their_sign() {
+        let event = Event::Started { channel: Channel::Can1 };
+        let powers = (0..63).flat_map(|bit| [(1_i64 << bit) - 1, 1 << bit, (1 << bit) + 1]);
+        for ticks in (-20_000..20_000)
+            .chain(powers.clone())
+            .chain(powers.map(|ticks| -ticks))
+            .chain([i64::MIN, i64::MAX])
+        {
+            let mut out = [0; MAX_RECORD];
+            let len = encode_event(&event, ticks, &mut out);
+            assert_eq!(decode(&out[..len]), Ok((Record::Event(event), ticks, &[][..])));
+            let mut by_postcard = [0; MAX_RECORD];
+            assert_eq!(&out[2..len], &*postcard::to_slice(&ticks, &mut by_postcard).unwrap());
+        }
+    }
+
+    #[test]
+    fn a_qualifier_that_qualifies_nothing_or_is_not_known_is_refused() {
+        let frame = [FRAME | 1, 0x23, 0x01, 0x00, 0xAA];
+        assert!(decode(&frame).is_ok() && decode(&[&[QUALIFIED | UPPER_BOUND], &frame[..]].concat()).is_ok());
+        for qualified in (QUALIFIED..fd::FD).filter(|first| !(fd::SENT..=fd::LAST_SENT).contains(first)) {
+            let known = (QUALIFIED | 1..=QUALIFIED | 7).contains(&qualified) && qualified & 3 != 3;
+            assert_eq!(decode(&[&[qualified], &frame[..]].concat()).is_ok(), known, "{qualified:02X}");
+        }
+    }
 }

@@ -94,4 +94,23 @@ mod tests {
             prop_assert_eq!(&out[..len], &encoded((value >> bits).into())[..]);
         }
     }
+
+    #[test]
+    fn the_largest_are_read_and_what_is_larger_or_longer_is_not() {
+        let [ones, zeros] = [[0xFF; 9], [0x80; 9]];
+        let long = |bytes: &[u8], last: u8| {
+            take_u64(&[bytes, &[last]].concat()).map(|(value, rest)| (value, rest.len()))
+        };
+        assert_eq!(
+            (long(&ones, 1), long(&ones, 2), long(&zeros, 1)),
+            (Some((u64::MAX, 0)), None, Some((1 << 63, 0)))
+        );
+        assert_eq!((long(&zeros, 2), long(&[0x80; 10], 0), long(&[0x80; 11], 1)), (None, None, None));
+        let short = |bytes: &[u8], last: u8| {
+            take_u32(&[bytes, &[last]].concat()).map(|(value, rest)| (value, rest.len()))
+        };
+        assert_eq!((short(&ones[..4], 15), short(&ones[..4], 16)), (Some((u32::MAX, 0)), None));
+        // A sixth byte would only be another way to write a number.
+        assert_eq!((short(&zeros[..4], 0), short(&zeros[..5], 0)), (Some((0, 0)), None));
+    }
 }

@@ -53,4 +53,13 @@ mod tests {
         assert_eq!(lines("one\r\ntwo\x07\rthree"), "one\ntwo\u{FFFD}\nthree");
         assert!(matches!(line("°C µ 温度"), Cow::Borrowed(_)));
     }
+
+    #[test]
+    fn a_text_is_cleaned_where_it_stands_and_left_alone_if_it_is_clean() {
+        for (text, clean) in [("a\x1b[0m\nb", "a\u{FFFD}[0m b"), ("plain", "plain")] {
+            let mut text = text.to_owned();
+            make(&mut text, line);
+            assert_eq!(text, clean);
+        }
+    }
 }

@@ -99,4 +99,21 @@ mod tests {
         assert_eq!(at(3_000_000_000, 990_000_000_000).since_ns(before), 2_000_000_000);
         assert_eq!(at(i64::MAX, u64::MAX).since_ns(at(i64::MIN, 1)), i64::MAX);
     }
+
+    /// A fiftieth, and a millisecond: what is between is a slow or fast clock, what is beyond is another one.
+    #[test]
+    fn a_clock_may_be_off_by_a_fiftieth_and_a_millisecond() {
+        let since = |utc_ns: i64, device_ns: u64| {
+            at(1_000_000_000 + utc_ns, 7_000_000_000 + device_ns).since_ns(at(1_000_000_000, 7_000_000_000))
+        };
+        assert_eq!((since(0, 1_000_000), since(0, 1_000_001)), (1_000_000, 0));
+        assert_eq!(
+            (since(1_000_000_000, 1_021_000_000), since(1_000_000_000, 1_021_000_001)),
+            (1_021_000_000, 1_000_000_000)
+        );
+        assert_eq!(
+            (since(1_000_000_000, 979_000_000), since(1_000_000_000, 978_999_999)),
+            (979_000_000, 1_000_000_000)
+        );
+    }
 }

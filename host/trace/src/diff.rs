@@ -291,4 +291,49 @@ mod tests {
         assert_eq!(difference.only_b, [(key("200"), 1)]);
         assert_eq!(difference.same, 1);
     }
+
+    #[test]
+    fn each_difference_alone_is_one() {
+        let whole = |a: &[(i64, &str)], b: &[(i64, &str)]| compare(&profile(a), &profile(b), 0.1);
+        let a: &[(i64, &str)] = &[(0, "100##011"), (10, "100##011")];
+        for (b, [period, dlcs, flags, bytes]) in [
+            (&[(0, "100##011"), (20, "100##011")][..], [true, false, false, false]),
+            (&[(0, "100##111"), (10, "100##111")], [false, false, true, false]),
+            (&[(0, "100##012"), (10, "100##012")], [false, false, false, true]),
+            // Only a longer frame has other lengths, and then it has other bytes, too.
+            (&[(0, "100##01100"), (10, "100##01100")], [false, true, false, true]),
+        ] {
+            let difference = whole(a, b);
+            assert!(!difference.is_none() && difference.same == 0);
+            let [changed] = &difference.changed[..] else { panic!("{difference:?}") };
+            let differs = [
+                changed.period_ns.is_some(),
+                changed.dlcs.is_some(),
+                changed.flags.is_some(),
+                !changed.bytes.is_empty(),
+            ];
+            assert_eq!(differs, [period, dlcs, flags, bytes]);
+        }
+        // Lengths differ without any byte that does: remote frames.
+        let difference = whole(&[(0, "100#R1")], &[(0, "100#R2")]);
+        assert_eq!(difference.changed[0].dlcs, Some((vec![1], vec![2])));
+        // What is on one side only is a difference, on either.
+        assert!(!whole(a, &[]).is_none() && !whole(&[], a).is_none() && whole(&[], &[]).is_none());
+        // One frame has no period.
+        assert!(whole(&[(0, "100#")], &[(5, "100#")]).is_none());
+    }
+
+    #[test]
+    fn channels_are_told_apart_unless_they_are_to_be_ignored() {
+        let on = |channel, mut profile: Profile| {
+            let event =
+                TraceEvent::Frame { frame: "100#".parse().unwrap(), direction: Direction::Rx, late: false };
+            profile.add(&TraceRecord { time_ns: 0, device_ns: None, channel, event });
+            profile
+        };
+        assert!(!compare(&on(1, Profile::default()), &on(2, Profile::default()), 0.1).is_none());
+        let ignoring = on(1, Profile::ignoring_channels());
+        assert_eq!(ignoring.kinds().map(|(key, _)| key.channel).collect::<Vec<_>>(), [0]);
+        assert!(compare(&ignoring, &on(2, Profile::ignoring_channels()), 0.1).is_none());
+    }
 }

@@ -56,3 +56,53 @@ impl fmt::Display for TraceEvent {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Direction, ErrorState};
+
+    /// What users read in every view, in files of text and in messages.
+    #[test]
+    fn every_event_says_what_happened_in_a_line() {
+        let lost = |stage, count, at_least| TraceEvent::Lost { stage, count, at_least };
+        let not_sent = |reason| TraceEvent::TransmitFailed { tag: 7, reason };
+        let frame =
+            TraceEvent::Frame { frame: "123#DEAD".parse().unwrap(), direction: Direction::Rx, late: false };
+        for (event, text) in [
+            (frame, "123#DEAD"),
+            (TraceEvent::BusError { kind: Some(BusErrorKind::Stuff), counters: None }, "bus error: stuff"),
+            (
+                TraceEvent::BusError { kind: None, counters: Some((8, 1)) },
+                "bus error: unknown, counters 8 / 1",
+            ),
+            (TraceEvent::ErrorsSuppressed { count: 3 }, "3 more bus errors"),
+            (TraceEvent::State { state: ErrorState::BusOff, counters: None }, "controller bus-off"),
+            (
+                TraceEvent::State { state: ErrorState::Passive, counters: Some((128, 0)) },
+                "controller passive, counters 128 / 0",
+            ),
+            (lost(Some(LossStage::Queue), 3, false), "3 frames lost (queue)"),
+            (lost(None, 3, true), "at least 3 frames lost (unknown)"),
+            (lost(Some(LossStage::Link), 0, true), "an unknown number of frames lost (link)"),
+            (lost(Some(LossStage::Link), 0, false), "0 frames lost (link)"),
+            (not_sent(TransmitFailure::BusOff), "frame 7 not sent: bus-off"),
+            (
+                not_sent(TransmitFailure::Overtaken { periods: 1 }),
+                "frame 7 not sent: overtaken: its next period came first",
+            ),
+            (
+                not_sent(TransmitFailure::Overtaken { periods: 2 }),
+                "frame 7 not sent: overtaken: its next 2 periods came first",
+            ),
+            (
+                not_sent(TransmitFailure::Loop),
+                "frame 7 not sent: loop: both channels of the gateway are on one bus, and it has ended",
+            ),
+            (TraceEvent::Disturbed { length_ns: 0 }, "not disturbed: the device was busy"),
+            (TraceEvent::Disturbed { length_ns: 12_340 }, "disturbed on purpose for 12.3 us"),
+        ] {
+            assert_eq!(event.to_string(), text);
+        }
+    }
+}

@@ -330,4 +330,67 @@ mod tests {
             assert_eq!(text.parse::<Filter>().unwrap_err().to_string(), message);
         }
     }
+
+    #[test]
+    fn a_channel_s_filter_passes_all_of_that_channel_and_nothing_of_another() {
+        let record = |channel, frame: &str| {
+            let event = TraceEvent::Frame {
+                frame: frame.parse().unwrap(),
+                direction: crate::Direction::Rx,
+                late: false,
+            };
+            TraceRecord { time_ns: 0, device_ns: None, channel, event }
+        };
+        let second = Filter::on_channel(2);
+        assert_eq!(second, "can1".parse().unwrap());
+        assert!(second.accepts_all_of(2) && !second.accepts_all_of(1));
+        assert!("any".parse::<Filter>().unwrap().accepts_all_of(1));
+        let one: Filter = "123".parse().unwrap();
+        assert!(!one.accepts_all_of(1) && !"can0,123".parse::<Filter>().unwrap().accepts_all_of(1));
+        // Of several, one is enough; none means everything.
+        assert!(
+            passes(&[], &record(1, "123#")) && passes(&[second.clone(), one.clone()], &record(1, "123#"))
+        );
+        assert!(
+            passes(&[second.clone(), one.clone()], &record(2, "124#"))
+                && !passes(&[second, one], &record(1, "124#"))
+        );
+    }
+
+    /// As the kernel applies them: with the format compared, a mask has no bits above the eleventh.
+    #[test]
+    fn a_standard_identifier_compared_with_its_format_has_eleven_bits() {
+        let passes = |filter: &str, frame: &str| {
+            filter.parse::<Filter>().unwrap().accepts_frame(&frame.parse().unwrap())
+        };
+        // Twenty-nine bits of the mask, and the format.
+        assert!(
+            passes("123:9FFFFFFF", "123#")
+                && !passes("123:9FFFFFFF", "00000123#")
+                && !passes("123:9FFFFFFF", "124#")
+        );
+        // Without the format, an extended one that has these bits passes, too.
+        assert!(
+            passes("123:7FF", "123#")
+                && passes("123:7FF", "1FFFF923#")
+                && !passes("123:1FFFFFFF", "1FFFF923#")
+        );
+        assert!(passes("00000123:9FFFFFFF", "00000123#") && !passes("00000123:9FFFFFFF", "123#"));
+        // And whether it is a remote frame, if that bit is in the mask.
+        assert!(
+            passes("123:7FF", "123#R") && !passes("123:400007FF", "123#R") && passes("123:400007FF", "123#")
+        );
+        assert!(!passes("123:C00007FF", "123#R"));
+    }
+
+    #[test]
+    fn what_looks_like_an_identifier_is_no_interface() {
+        let of = |text: &str| text.parse::<Filter>().map(|filter| (filter.channel, filter.ids.len())).ok();
+        assert_eq!(
+            (of("vcan3"), of("my_bus1"), of("slcan0")),
+            (Some((Some(4), 0)), Some((Some(2), 0)), Some((Some(1), 0)))
+        );
+        assert_eq!((of("BEEF1"), of("0x1"), of("C0")), (Some((None, 1)), Some((None, 1)), Some((None, 1))));
+        assert_eq!((of("my-bus1"), of("_bus1"), of("0xbus1"), of("can300")), (None, None, None, None));
+    }
 }

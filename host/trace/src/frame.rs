@@ -207,4 +207,15 @@ mod tests {
             assert_eq!(text.parse::<TraceFrame>(), Err(fault), "{text}");
         }
     }
+
+    #[test]
+    fn a_trace_s_frame_is_the_classical_one_that_it_was_made_of_and_no_other() {
+        let classic: Frame = "123#11".parse().unwrap();
+        let frame = TraceFrame::from(classic);
+        assert!(frame == classic && frame != "123#12".parse::<Frame>().unwrap());
+        assert_eq!((frame.classic(), frame.fd()), (Some(&classic), None));
+        let fd: TraceFrame = "123##011".parse().unwrap();
+        assert!(fd != classic && fd.classic().is_none() && fd.fd().is_some());
+        assert_eq!(format!("{frame:?} {fd:?}"), "Frame(123#11) FdFrame(123##011)");
+    }
 }

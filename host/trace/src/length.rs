@@ -37,3 +37,20 @@ impl TraceFrame {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_bits_of_an_fd_frame_are_those_at_both_rates() {
+        let bits = |text: &str| text.parse::<TraceFrame>().unwrap().bus_bits();
+        let switched = bits("123##1AABB");
+        assert!(
+            switched.nominal > 0
+                && switched.data > 16
+                && switched.total() == switched.nominal + switched.data
+        );
+        assert_eq!((bits("123#AABB").data, bits("123#AABB").total()), (0, bits("123#AABB").nominal));
+    }
+}

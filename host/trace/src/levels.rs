@@ -70,4 +70,21 @@ mod tests {
         let ack = levels.len() - ACK_SLOT_FROM_END;
         assert!(levels[ack - 1..].iter().all(|recessive| *recessive));
     }
+
+    /// Start of frame, the base identifier, SRR and IDE, the extension, RTR, r1 and r0, the DLC.
+    #[test]
+    fn the_header_of_a_remote_frame_is_as_iso_11898_has_it() {
+        let begin = |text: &str, len| -> String {
+            levels(&text.parse().unwrap())[..len]
+                .iter()
+                .map(|recessive| if *recessive { '1' } else { '0' })
+                .collect()
+        };
+        assert_eq!(begin("2AA#R5", 19), ["0", "01010101010", "1", "0", "0", "0101"].concat());
+        assert_eq!(
+            begin("0AAAAAAA#R5", 39),
+            ["0", "01010101010", "11", "101010101010101010", "1", "0", "0", "0101"].concat()
+        );
+        assert_eq!(begin("0AAAAAAA#5A", 33), ["0", "01010101010", "11", "101010101010101010", "0"].concat());
+    }
 }

@@ -311,4 +311,26 @@ mod tests {
         // Of four data bytes: kind, channel, three of time, two of the identifier, the length.
         assert_eq!(bytes.len(), 12 * 100 + 6);
     }
+
+    #[test]
+    fn damage_is_reported_where_its_record_begins() {
+        let records = [data_record(0), data_record(1_000)];
+        let mut bytes = Vec::new();
+        write(&records, &mut bytes);
+        let mut first = Vec::new();
+        write(&records[..1], &mut first);
+        let cut = &bytes[..bytes.len() - 1];
+        assert_eq!(read_all(cut), (records[..1].to_vec(), Err(Damaged { at: first.len(), len: cut.len() })));
+    }
+
+    #[test]
+    fn a_number_of_more_than_64_bits_and_a_dlc_of_more_than_four_are_refused() {
+        // Kind, channel, the time in ten bytes, the identifier, the DLC.
+        let frame = |tenth, dlc| read_all(&[&[DATA, 1], &[0xFF; 9][..], &[tenth], &[0x23, dlc]].concat());
+        assert!(frame(1, 0).1.is_ok() && frame(2, 0).1.is_err());
+        let times = |tenth| frame(tenth, 0).0.iter().map(|record| record.time_ns).collect::<Vec<_>>();
+        assert_eq!((times(1), times(0)), (vec![i64::MIN], vec![-(1 << 62)]));
+        let eight = |dlc| read_all(&[&[DATA, 1, 0, 0x23, dlc], &[7; 8][..]].concat());
+        assert!(eight(15).1.is_ok() && eight(16).1.is_err());
+    }
 }

@@ -410,4 +410,27 @@ mod tests {
         assert_eq!(playback.position_ns(ms(504)), at(4).time_ns);
         assert_eq!(playback.position_ns(ms(5000)), at(10).time_ns);
     }
+
+    #[test]
+    fn what_was_switched_on_is_said() {
+        let mut playback = playing(&[0, 10]);
+        assert!(!playback.is_paused() && !playback.is_looped());
+        playback.pause(ms(500));
+        playback.set_looped(true);
+        assert!(playback.is_paused() && playback.is_looped());
+        playback.resume(ms(600));
+        playback.set_looped(false);
+        assert!(!playback.is_paused() && !playback.is_looped());
+    }
+
+    #[test]
+    fn a_place_is_reached_before_its_own_record() {
+        let mut playback = playing(&[0, 10, 20]);
+        let mut times = Vec::new();
+        while let Some(record) = playback.forward_to(at(10).time_ns, ms(500)) {
+            times.push((record.time_ns - at(0).time_ns) / MS);
+        }
+        assert_eq!(times, [0]);
+        assert_eq!(due(&mut playback, 500), (vec![10], Due::Wait(ms(10))));
+    }
 }

@@ -24,3 +24,23 @@ impl std::fmt::Display for Seconds {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_have_six_decimals_or_nine() {
+        for (ns, text) in [
+            (0, "0.000000"),
+            (1_500_000_000, "1.500000"),
+            (61_000_001_000, "61.000001"),
+            (1_000_000_001, "1.000000001"),
+            (-1, "-0.000000001"),
+            (-1_500_000_000, "-1.500000"),
+            (i64::MIN, "-9223372036.854775808"),
+        ] {
+            assert_eq!(Seconds(ns).to_string(), text);
+        }
+    }
+}

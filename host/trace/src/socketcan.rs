@@ -304,4 +304,84 @@ mod tests {
         assert!(!whole(0x088, [0, 0, 4, 0x0B, 0, 0, 0, 0]) && !whole(0x002, [9, 0, 0, 0, 0, 0, 0, 0]));
         assert!(!whole(0x010, [0, 0, 0, 0, 4, 0, 0, 0]));
     }
+
+    /// As drivers name them: the kind in byte 2, or the place in the frame in byte 3 (`linux/can/error.h`).
+    #[test]
+    fn every_kind_of_error_that_a_driver_names_is_read() {
+        use BusErrorKind::{Acknowledgment, BitDominant, BitRecessive, Crc, Form, Stuff};
+        let kind = |classes, what, place| {
+            let (event, second) = ErrorFrame { classes, data: [0, 0, what, place, 0, 0, 0, 0] }.events();
+            assert_eq!(second, None);
+            let TraceEvent::BusError { kind, counters: None } = event else { panic!("{event}") };
+            kind
+        };
+        for (what, place, expected) in [
+            (0x04, 0, Some(Stuff)),
+            (0x02, 0, Some(Form)),
+            (0x08, 0, Some(BitDominant)),
+            (0x10, 0, Some(BitRecessive)),
+            (0x01, 0, Some(BitRecessive)),
+            (0, 0x08, Some(Crc)),
+            (0, 0x18, Some(Crc)),
+            (0, 0x19, Some(Acknowledgment)),
+            (0, 0x0B, None),
+            (0x20, 0, None),
+            (0, 0, None),
+            // A kind says more than a place.
+            (0x02, 0x19, Some(Form)),
+            (0x10, 0x08, Some(BitRecessive)),
+        ] {
+            assert_eq!(kind(BUS_ERROR | PROTOCOL, what, place), expected, "{what:02X} {place:02X}");
+        }
+        // Nobody acknowledged, whatever else is there; without the class, byte 2 belongs to something else.
+        assert_eq!(kind(BUS_ERROR | PROTOCOL | NO_ACK, 0x04, 0), Some(Acknowledgment));
+        assert_eq!(kind(BUS_ERROR, 0x04, 0x08), None);
+    }
+
+    #[test]
+    fn what_several_classes_say_together_is_told_apart() {
+        let events = |classes, data| ErrorFrame { classes, data }.events();
+        let state = |state| TraceEvent::State { state, counters: None };
+        let bus_error = |kind| TraceEvent::BusError { kind: Some(kind), counters: None };
+        assert_eq!(events(CONTROLLER, [0, ACTIVE, 0, 0, 0, 0, 0, 0]), (state(ErrorState::Active), None));
+        assert_eq!(events(BUS_OFF, [0; 8]), (state(ErrorState::BusOff), None));
+        // The error that changed the state, if it is named: nobody acknowledged.
+        let no_ack = bus_error(BusErrorKind::Acknowledgment);
+        assert_eq!(
+            events(CONTROLLER | NO_ACK, [0, 8, 0, 0, 0, 0, 0, 0]),
+            (state(ErrorState::Warning), Some(no_ack))
+        );
+        // Without its class, byte 1 is no state.
+        assert_eq!(
+            events(PROTOCOL, [0, ACTIVE | 0x30 | 0x0C, 4, 0, 0, 0, 0, 0]),
+            (bus_error(BusErrorKind::Stuff), None)
+        );
+        // Byte 2 is the kind of an error rather than the count of a loss.
+        let lost = TraceEvent::Lost { stage: None, count: 1, at_least: true };
+        assert_eq!(events(CONTROLLER | PROTOCOL, [0, RX_OVERFLOW, 4, 0, 0, 0, 0, 0]), (lost, None));
+        // A frame that met an error is that error; what was lost by arbitration alone was not sent.
+        assert_eq!(
+            events(LOST_ARBITRATION | PROTOCOL, [0, 0, 4, 0, 0, 0, 0, 0]),
+            (bus_error(BusErrorKind::Stuff), None)
+        );
+        assert_eq!(events(TX_TIMEOUT | NO_ACK, [0; 8]), (no_ack, None));
+        let not_sent = |reason| (TraceEvent::TransmitFailed { tag: 0, reason }, None);
+        assert_eq!(
+            events(LOST_ARBITRATION, [9, 0, 0, 0, 0, 0, 0, 0]),
+            not_sent(TransmitFailure::ArbitrationLost)
+        );
+        assert_eq!(events(TX_TIMEOUT, [0; 8]), not_sent(TransmitFailure::Aborted));
+        // The bytes of an overtaken frame's tag are counters here.
+        let named = events(TX_TIMEOUT | COUNTERS, [0, OVERTAKEN, 5, 0, 0, 0, 1, 2]);
+        assert_eq!(named, not_sent(TransmitFailure::Aborted));
+        // Our own counts are not read out of a driver's bytes.
+        for class in [PROTOCOL, NO_ACK] {
+            let (event, _) = events(BUS_ERROR | class, [SUPPRESSED, 0, 4, 0, 0, 0, 0, 0]);
+            assert!(matches!(event, TraceEvent::BusError { .. }), "{event}");
+        }
+        let (event, _) = events(BUS_ERROR | LOST_ARBITRATION, [SUPPRESSED, 0, 0, 0, 0, 0, 0, 0]);
+        assert!(matches!(event, TraceEvent::TransmitFailed { .. }), "{event}");
+        let (event, _) = events(BUS_ERROR | PROTOCOL, [DISTURBED, 0, 4, 0, 0, 0, 0, 0]);
+        assert!(matches!(event, TraceEvent::BusError { .. }), "{event}");
+    }
 }

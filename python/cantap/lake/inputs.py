@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .._native import is_trace_name
 from .._sources import file_system, files, in_order, is_url, opener, own_file
 
 CHUNK_BYTES = 1 << 20
@@ -116,11 +117,23 @@ def _below(url: str) -> list[tuple[list[str], tuple[str, Any]]] | None:
     path = path.rstrip("/")
     own = posixpath.basename(path) or "unknown"
     found = [([posixpath.basename(posixpath.dirname(name)) or "unknown"], opener(system, name)) for name in own_file(system, path)]
-    for name in sorted(system.find(path), key=in_order):
+    objects = {name: about["size"] for name, about in system.find(path, detail=True).items()}
+    folders = _folders(objects)
+    for name in sorted(objects, key=in_order):
         parts = [part for part in name[len(path) :].split("/") if part]
-        # An object whose name ends like a folder's is what some programs make of an empty folder.
-        if parts and name != path and not parts[-1].startswith(".") and not name.endswith("/"):
+        # An empty object that is called like a folder is what some programs make of one.
+        is_folder = not objects[name] and (name.endswith("/") or name in folders and not is_trace_name(name))
+        if parts and name != path and not parts[-1].startswith(".") and not is_folder:
             found.append((parts if len(parts) > 1 else [own, *parts], opener(system, name)))
     if not found:
         raise FileNotFoundError(f"there is no file below {url}")
+    return found
+
+
+def _folders(names: Iterable[str]) -> set[str]:
+    """All folders that the names are in, and those that these are in."""
+    found: set[str] = set()
+    for name in names:
+        while (name := posixpath.dirname(name)) and name not in found:
+            found.add(name)
     return found

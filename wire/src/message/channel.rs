@@ -114,3 +114,55 @@ impl Filter {
         kind && frame.id().is_extended() == self.extended && (frame.id().raw() ^ self.id) & self.mask == 0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_mode_has_a_name_of_its_own_and_all_but_listening_send() {
+        assert!(Mode::ALL.iter().all(|mode| Mode::from_name(mode.name()) == Some(*mode)));
+        assert_eq!(Mode::ALL.map(Mode::name), ["listen-only", "normal", "loopback", "silent-loopback"]);
+        assert_eq!(Mode::ALL.map(Mode::transmits), [false, true, true, true]);
+        assert_eq!(Mode::from_name("listen"), None);
+    }
+
+    #[test]
+    fn a_filter_passes_frames_of_its_kind_whose_masked_bits_agree() {
+        let frame = |text: &str| text.parse::<Frame>().unwrap();
+        let passes =
+            |extended, kind, id, mask, text| Filter { extended, kind, id, mask }.matches(&frame(text));
+        assert!(
+            passes(false, FrameKind::Any, 0x120, 0x7F0, "123#11")
+                && passes(false, FrameKind::Any, 0x120, 0x7F0, "12F#R")
+        );
+        assert!(
+            !passes(false, FrameKind::Any, 0x120, 0x7F0, "133#11")
+                && !passes(false, FrameKind::Any, 0x120, 0x7FF, "123#11")
+        );
+        // Bits that the mask leaves out may be anything, in the filter too.
+        assert!(passes(false, FrameKind::Any, 0x123, 0x7F0, "120#"));
+        assert!(
+            passes(true, FrameKind::Any, 0x123, 0x1FFF_FFFF, "00000123#")
+                && !passes(true, FrameKind::Any, 0x123, 0x7FF, "123#")
+        );
+        assert!(!passes(false, FrameKind::Any, 0x123, 0x7FF, "00000123#"));
+        for (kind, data, remote) in
+            [(FrameKind::Data, true, false), (FrameKind::Remote, false, true), (FrameKind::Any, true, true)]
+        {
+            assert_eq!(
+                (passes(false, kind, 0, 0, "123#11"), passes(false, kind, 0, 0, "123#R")),
+                (data, remote),
+                "{kind:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_filter_has_no_bits_that_no_identifier_has() {
+        let valid = |extended, id, mask| Filter { extended, kind: FrameKind::Any, id, mask }.is_valid();
+        assert!(valid(false, 0x7FF, 0x7FF) && valid(true, 0x1FFF_FFFF, 0x1FFF_FFFF));
+        assert!(!valid(false, 0x800, 0x7FF) && !valid(false, 0x7FF, 0x800));
+        assert!(!valid(true, 0x2000_0000, 0) && !valid(true, 0, 0x2000_0000));
+    }
+}

@@ -159,3 +159,135 @@ pub struct RuleCounts {
     /// Given up by the controller or with the channel: [`crate::Event::TransmitFailed`] says why.
     pub failed: u32,
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::message::{Checksum, FrameKind};
+
+    fn frame(text: &str) -> Frame {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn an_unchanged_frame_is_sent_as_received() {
+        for text in
+            ["123#", "7FF#1122334455667788", "123#R8", "123#1122334455667788_F", "00000123#11", "1FFFFFFF#R"]
+        {
+            assert_eq!(
+                Pass::unchanged(frame(text).id().is_extended()).changed(&frame(text)),
+                Some(frame(text)),
+                "{text}"
+            );
+        }
+        let pass = Pass::unchanged(false);
+        assert!(pass.modifiers.is_empty() && (pass.period_ticks, pass.delay_ticks) == (0, 0));
+    }
+
+    #[test]
+    fn bits_are_kept_by_the_and_and_inverted_by_the_xor() {
+        let pass = Pass {
+            id_and: 0x0F0,
+            id_xor: 0x701,
+            dlc_and: 0b1110,
+            dlc_xor: 0b0001,
+            data_and: [0xF0, 0xFF, 0xFF, 0, 0, 0, 0, 0],
+            data_xor: [0x05, 0, 0xFF, 0, 0xA5, 0, 0, 0],
+            ..Pass::unchanged(false)
+        };
+        // One byte more than was received: of the eight bytes, those behind the data are zero.
+        assert_eq!(pass.changed(&frame("123#123456AB")), Some(frame("721#1534A900A5")));
+        assert_eq!(
+            Pass { extended: true, ..pass.clone() }.changed(&frame("123#R4")),
+            Some(frame("00000721#R5"))
+        );
+        // A DLC has four bits, whatever the rule says.
+        assert_eq!(
+            Pass { dlc_xor: 0xF0, ..Pass::unchanged(false) }.changed(&frame("123#11")),
+            Some(frame("123#11"))
+        );
+        assert_eq!(Pass { id_xor: 0x800, ..Pass::unchanged(false) }.changed(&frame("123#")), None);
+        assert_eq!(Pass { id_xor: 0x2000_0000, ..Pass::unchanged(true) }.changed(&frame("123#")), None);
+    }
+
+    fn rule() -> impl Strategy<Value = GatewayRule> {
+        // Few bits that the filter leaves open, so that every identifier can be tried.
+        let bits = || (any::<u32>(), 0..32_u32).prop_map(|(bits, narrow)| bits >> narrow);
+        let open = (0..30_u32, 0..30_u32, 0..30_u32).prop_map(|(a, b, c)| 1 << a | 1 << b | 1 << c);
+        (any::<[bool; 3]>(), bits(), open, bits(), bits()).prop_map(
+            |([received, sent, keeps], id, open, id_and, id_xor)| {
+                let widest = if received { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+                let filter = Filter {
+                    extended: received,
+                    kind: FrameKind::Any,
+                    id: id & widest,
+                    mask: widest & !open,
+                };
+                let id_and = if keeps { u32::MAX } else { id_and };
+                GatewayRule { filter, pass: Some(Pass { id_and, id_xor, ..Pass::unchanged(sent) }) }
+            },
+        )
+    }
+
+    proptest! {
+        /// What the device refuses is what could not be sent, and nothing else.
+        #[test]
+        fn a_rule_is_valid_if_each_frame_that_it_matches_can_be_sent(rule in rule()) {
+            let Filter { extended, id, mask, .. } = rule.filter;
+            let widest = if extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+            let open = widest & !mask;
+            let mut every_frame_can_be_sent = true;
+            let mut part = 0;
+            loop {
+                let raw = id & mask | part;
+                let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.unwrap();
+                let received = Frame::from_bus(id, false, 0, [0; 8]);
+                prop_assert!(rule.filter.matches(&received));
+                every_frame_can_be_sent &= rule.pass.as_ref().unwrap().changed(&received).is_some();
+                part = part.wrapping_sub(open) & open;
+                if part == 0 {
+                    break;
+                }
+            }
+            prop_assert_eq!(rule.has_valid_ids(), every_frame_can_be_sent);
+        }
+    }
+
+    #[test]
+    fn a_rule_whose_filter_no_frame_can_match_is_not_valid() {
+        for pass in [None, Some(Pass::unchanged(true))] {
+            let rule = |id, mask| {
+                let filter = Filter { extended: false, kind: FrameKind::Any, id, mask };
+                GatewayRule { filter, pass: pass.clone() }.has_valid_ids()
+            };
+            assert!(rule(0x7FF, 0x7FF) && !rule(0x800, 0x7FF) && !rule(0, 0x800));
+        }
+    }
+
+    #[test]
+    fn changes_stay_inside_eight_bytes_and_four_bits() {
+        let valid = |change: &dyn Fn(&mut Pass)| {
+            let mut pass = Pass::unchanged(false);
+            change(&mut pass);
+            let filter = Filter { extended: false, kind: FrameKind::Any, id: 0, mask: 0 };
+            GatewayRule { filter, pass: Some(pass) }.has_valid_changes()
+        };
+        assert!(valid(&|_| ()) && valid(&|pass| (pass.dlc_and, pass.dlc_xor) = (15, 15)));
+        assert!(!valid(&|pass| pass.dlc_and = 16) && !valid(&|pass| pass.dlc_xor = 16));
+        let modified = |modifier: Modifier| valid(&|pass| pass.modifiers.push(modifier).unwrap());
+        assert!(modified(Modifier::Random { byte: 7 }) && !modified(Modifier::Random { byte: 8 }));
+        let checksum = |byte| Modifier::Checksum { byte, algorithm: Checksum::Xor };
+        assert!(modified(checksum(7)) && !modified(checksum(8)));
+        let counter = |byte, low_bit, bits| modified(Modifier::Counter { byte, low_bit, bits });
+        assert!(counter(7, 0, 8) && counter(0, 7, 1) && counter(0, 4, 4));
+        assert!(
+            !counter(8, 0, 8)
+                && !counter(0, 8, 1)
+                && !counter(0, 4, 5)
+                && !counter(0, 0, 0)
+                && !counter(0, 0, 9)
+        );
+    }
+}

@@ -36,3 +36,14 @@ impl fmt::Display for Role {
         f.write_str(self.name())
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_role_includes_those_before_it_and_nobody_has_more_than_listening_unasked() {
+        assert!(Role::ALL.is_sorted() && Role::default() == Role::Listen);
+        assert_eq!(Role::ALL.map(|role| role.to_string()), ["listen", "configure", "send"]);
+    }
+}

@@ -3,6 +3,7 @@
 mod budget;
 mod damage;
 mod pinned;
+mod reports;
 mod samples;
 mod session_end;
 mod vectors;

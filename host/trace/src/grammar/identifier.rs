@@ -328,4 +328,28 @@ mod tests {
             assert!(frame(text).is_err(), "{text}");
         }
     }
+
+    #[test]
+    fn a_frame_is_filled_to_a_length_of_can_fd_only_if_asked() {
+        let frame = |text: &str, pad| any_frame(text, pad).map(|frame| frame.to_string());
+        let nine = "123##111.22.33.44.55.66.77.88.99";
+        assert!(frame(nine, false).unwrap_err().contains("0 to 8, 12, 16"));
+        assert_eq!(frame(nine, true), Ok("123##1112233445566778899000000".to_owned()));
+        assert_eq!(frame("123##31122", true), Ok("123##31122".to_owned()));
+        // Twelve are a length, thirteen become sixteen; more than 64 are none.
+        let bytes = |count| format!("123##0{}", "AB".repeat(count));
+        assert_eq!(frame(&bytes(12), true), Ok(bytes(12)));
+        assert_eq!(frame(&bytes(13), true), Ok(bytes(13) + "000000"));
+        assert_eq!((frame(&bytes(63), true), frame(&bytes(64), true)), (Ok(bytes(63) + "00"), Ok(bytes(64))));
+        assert!(frame(&bytes(65), true).unwrap_err().contains("64"));
+        assert!(frame("123##0112", true).is_err());
+        assert_eq!(frame("1#00", true), Ok("001#00".to_owned()));
+    }
+
+    #[test]
+    fn a_pattern_is_shown_as_it_was_written() {
+        for text in ["123", "0x12?", "100-1FF", "120:7F0"] {
+            assert_eq!(text.parse::<IdPattern>().unwrap().to_string(), text);
+        }
+    }
 }

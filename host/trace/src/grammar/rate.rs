@@ -56,4 +56,9 @@ mod tests {
             assert!(bit_rate(text).is_err(), "{text}");
         }
     }
+
+    #[test]
+    fn the_slowest_rate_that_is_taken_as_written_is_1500() {
+        assert_eq!((bit_rate("1500"), bit_rate("1499").is_err()), (Ok(1_500), true));
+    }
 }

@@ -106,4 +106,14 @@ mod tests {
         }
         assert_eq!(positive_duration("0s").unwrap_err(), "give a time longer than zero");
     }
+
+    #[test]
+    fn sixty_seconds_are_a_minute_and_sixty_minutes_an_hour() {
+        assert_eq!(
+            (duration("1:59.5").map(|time| time.as_millis()), duration("1:59:00").map(|time| time.as_secs())),
+            (Ok(119_500), Ok(7_140))
+        );
+        assert_eq!(duration("90:00").map(|time| time.as_secs()), Ok(5_400));
+        assert!(duration("1:60:00").is_err() && duration("1:00:60").is_err() && duration("0:60").is_err());
+    }
 }

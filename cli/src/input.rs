@@ -142,6 +142,9 @@ pub struct Records {
     filters: Vec<Filter>,
     channels: Channels,
     range: TimeRange,
+    /// The latest time of those that were read, if only a range is wanted, and whether any was in that.
+    latest_ns: Option<i64>,
+    has_any: bool,
     strict: bool,
     /// The batch from which [`Self::next`] takes; the records before `at` are used up.
     batch: Vec<TraceRecord>,
@@ -194,7 +197,17 @@ impl ReadArgs {
 impl Records {
     fn new(source: Source, filters: Vec<Filter>, strict: bool) -> Self {
         let (channels, range) = (Channels::all(), TimeRange::default());
-        Self { source, filters, channels, range, strict, batch: Vec::new(), at: 0 }
+        Self {
+            source,
+            filters,
+            channels,
+            range,
+            latest_ns: None,
+            has_any: false,
+            strict,
+            batch: Vec::new(),
+            at: 0,
+        }
     }
 
     /// Only the records in a range, which may begin at a time after the first record, whether or not that passes the filters.
@@ -280,7 +293,12 @@ impl Records {
             Source::Device(live) => live.next_batch(records)?,
         };
         if !self.range.is_all() {
+            self.latest_ns = self.latest_ns.max(records.iter().map(|record| record.time_ns).max());
             records.retain(|record| self.range.contains(record));
+            self.has_any |= !records.is_empty();
+            if !more {
+                self.report_empty_range();
+            }
         }
         if self.channels != Channels::all() {
             records.retain(|record| self.channels.has(record.channel));
@@ -289,6 +307,18 @@ impl Records {
             records.retain(|record| self.filters.iter().any(|filter| filter.accepts(record)));
         }
         Ok(more)
+    }
+
+    /// Says that nothing was in the range: an empty result would look as if there were no traffic.
+    fn report_empty_range(&self) {
+        let (Some(first_ns), Some(latest_ns), false) = (self.range.first_ns(), self.latest_ns, self.has_any)
+        else {
+            return;
+        };
+        let seconds = latest_ns.saturating_sub(first_ns) as f64 / 1e9;
+        eprintln!(
+            "cantap: note: no record is between --start and --end; the trace's last one is {seconds:.3} s after its first"
+        );
     }
 
     /// The next record, like [`Self::next_batch`].

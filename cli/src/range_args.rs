@@ -31,6 +31,12 @@ impl RangeArgs {
                 "--start and --end choose a part of a trace; how long a device is listened to says -t",
             ));
         }
+        if let (Some(TimePoint::At(start)), Some(TimePoint::At(end)))
+        | (Some(TimePoint::AfterFirst(start)), Some(TimePoint::AfterFirst(end))) = (self.start, self.end)
+            && end <= start
+        {
+            return Err(usage("nothing is between --start and --end: the end is not after the start"));
+        }
         Ok(TimeRange::new(self.start, self.end))
     }
 }

@@ -63,6 +63,7 @@ pub fn run(
     interrupt::watch()?;
     let mut screen = Screen::enter()?;
     let mut sources = vec![Watched::start(origin, app, model, orders)?];
+    sources[0].app.begin();
     let result = display(&mut screen, &mut sources);
     drop(screen);
     // Each source finishes its recording properly first.
@@ -181,6 +182,7 @@ fn follow(request: Request, sources: &mut Vec<Watched>, current: usize) -> anyho
     match request {
         Request::Open(path) => {
             let opened = sources[current].open_trace(path)?;
+            sources[current].app.set_aside();
             sources.push(opened);
             Ok(sources.len() - 1)
         }
@@ -190,6 +192,7 @@ fn follow(request: Request, sources: &mut Vec<Watched>, current: usize) -> anyho
             if sources.len() == 1 {
                 "there is one source; O opens a trace beside it".clone_into(&mut sources[0].app.message);
             }
+            sources[current].app.set_aside();
             Ok((current + 1) % sources.len())
         }
         Request::Close if sources.len() == 1 => {
@@ -223,6 +226,10 @@ pub fn once(
     time: Duration,
 ) -> anyhow::Result<Once> {
     let is_file = matches!(origin, Origin::File(_));
+    // Nobody is there to be asked whether to take part in the bus.
+    if app.plan.as_ref().is_some_and(|plan| plan.mode().transmits()) {
+        app.begin();
+    }
     let model: Shared = Arc::new(Mutex::new(model));
     let thread = start(origin, &model, orders)?;
     if is_file {

@@ -46,6 +46,8 @@ pub enum Order {
     StopScript(String),
     /// A key for the scripts.
     ScriptKey(char),
+    /// Ask a vehicle on the first device, or no more.
+    Ask(bool),
     /// Write the send list to a new file.
     WriteList(PathBuf, String),
     /// Playback: faster.

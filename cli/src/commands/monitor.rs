@@ -67,7 +67,7 @@ pub struct Args {
     /// A profile: device, bit rates, databases, filters, view, send list.
     #[arg(short, long, value_name = "FILE")]
     profile: Option<PathBuf>,
-    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record, nodes or scripts.
+    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record, nodes, scripts or obd.
     #[arg(long, value_name = "PAGE", value_parser = view)]
     view: Option<View>,
     /// Record to this file from the start.
@@ -102,7 +102,7 @@ const WATCHED: Duration = Duration::from_secs(1);
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
     found.ok_or_else(|| {
-        "a page is trace, fixed, signals, graph, statistics, send, record, nodes or scripts".to_owned()
+        "a page is trace, fixed, signals, graph, statistics, send, record, nodes, scripts or obd".to_owned()
     })
 }
 

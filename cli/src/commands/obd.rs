@@ -1,35 +1,27 @@
 //! `cantap obd`: queries a vehicle.
 
-mod services;
-mod table;
-
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::io::{IsTerminal as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context as _, anyhow, bail};
-use cantap::Id;
+use anyhow::{Context as _, bail};
 use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
-use cantap_protocols::iso_tp::{Endpoint, Pair};
-use cantap_protocols::{Event, EventKind, Value};
+use cantap_protocols::{Event, Value};
 
-use self::services::Services;
-use self::table::Table;
 use crate::keyboard::Keyboard;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
 use cantap_work::code_texts::CodeTexts;
 use cantap_work::interrupt;
-use cantap_work::uds::{Client, TransferOptions};
+use cantap_work::obd::{Table, Vehicle, is_answer};
+use cantap_work::uds::Client;
 
 /// How often keys are looked for, and how many of them.
 const LOOK_FOR_KEYS: Duration = Duration::from_millis(100);
 const KEYS: usize = 64;
-/// Bits of a list of supported parameters.
-const LIST: u8 = 0x20;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -103,12 +95,6 @@ fn pid(text: &str) -> Result<u8, String> {
         .map_err(|_| "write a parameter as two hexadecimal digits, as 0C".to_owned())
 }
 
-/// An ECU that answers.
-struct Server {
-    answers_with: Endpoint,
-    pids: Vec<u8>,
-}
-
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if matches!(args.what, Some(What::Clear { yes: false })) {
@@ -127,37 +113,30 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let texts = args.dtc.as_deref().map(code_texts).transpose()?;
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
-    let mut vehicle = Vehicle {
-        client: Client::new(speaking, transfer(false, args.p2), stderr::reporter()),
-        p2: args.p2,
-        services: Services::Own,
-        is_extended: false,
-        texts,
-        table: None,
-        keyboard: None,
-        servers: Vec::new(),
-    };
-    vehicle.find()?;
+    let vehicle = Vehicle::new(args.p2);
+    let client = Client::new(speaking, vehicle.transfer(), stderr::reporter());
+    let mut asker = Asker { client, vehicle, texts, table: None, keyboard: None };
+    asker.find()?;
     match &args.what {
-        None => vehicle.everything(args.speak.json)?,
+        None => asker.everything(args.speak.json)?,
         Some(What::Supported) => {
-            vehicle.lists()?;
-            vehicle.client.show_if(|event| args.speak.json && is_answer(event))?;
+            asker.lists()?;
+            asker.client.show_if(|event| args.speak.json && is_answer(event))?;
             if !args.speak.json {
-                vehicle.show_lists()?;
+                asker.show_lists()?;
             }
         }
-        Some(What::Live { polling }) => vehicle.live(polling, &mut |_| Ok(()))?,
-        Some(What::Watch { polling }) => vehicle.watch(polling, args.speak.json)?,
-        Some(What::Codes) => vehicle.codes()?,
-        Some(What::Vin) => vehicle.identification()?,
+        Some(What::Live { polling }) => asker.live(polling, &mut |_| Ok(()))?,
+        Some(What::Watch { polling }) => asker.watch(polling, args.speak.json)?,
+        Some(What::Codes) => asker.codes()?,
+        Some(What::Vin) => asker.identification()?,
         Some(What::Clear { .. }) => {
-            let request = vehicle.services.clear();
+            let request = asker.vehicle.services().clear();
             // What was said to find the ECUs.
-            vehicle.client.speaking.take_events();
-            let answers = vehicle.client.ask_whoever(request, None)?;
-            vehicle.client.show_if(is_answer)?;
-            vehicle.client.all_agreed()?;
+            asker.client.speaking.take_events();
+            let answers = asker.client.ask_whoever(request, None)?;
+            asker.client.show_if(is_answer)?;
+            asker.client.all_agreed()?;
             if answers.is_empty() {
                 bail!(
                     "no ECU said that it has erased its codes; some want the engine off and the ignition on"
@@ -165,7 +144,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         }
     }
-    drop(vehicle);
+    drop(asker);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
 }
@@ -187,111 +166,55 @@ fn codes_of(event: &Event) -> impl Iterator<Item = String> + '_ {
     names.filter(|name| !name.is_empty()).map(str::to_owned)
 }
 
-/// How to address all ECUs.
-fn transfer(extended: bool, p2: Duration) -> TransferOptions {
-    let endpoint = |id| Endpoint { id, address: None };
-    let (a, b) = if extended {
-        (Id::extended_truncated(0x18DA_10F1), Id::extended_truncated(0x18DA_F110))
-    } else {
-        (Id::standard_truncated(0x7E0), Id::standard_truncated(0x7E8))
-    };
-    TransferOptions::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, p2, true)
-}
-
-/// Whether it is an answer, or a broken one.
-fn is_answer(event: &Event) -> bool {
-    matches!(event.kind, EventKind::Exchange | EventKind::Refusal | EventKind::Broken)
-}
-
-/// The parameters of a list that starts after `base`.
-fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
-    let bits = bits.iter().take(4).fold(0_u32, |all, byte| all << 8 | u32::from(*byte));
-    (0..u32::from(LIST))
-        .filter(|at| bits >> (31 - at) & 1 == 1)
-        .map(|at| base.wrapping_add(at as u8 + 1))
-        .collect()
-}
-
 /// The columns and rows of the terminal.
 fn screen() -> (usize, usize) {
     let size = terminal_size::terminal_size();
     size.map_or((100, usize::MAX), |(columns, rows)| (usize::from(columns.0), usize::from(rows.0)))
 }
 
-struct Vehicle<'d> {
+struct Asker<'d> {
     client: Client<'d>,
-    p2: Duration,
-    services: Services,
-    /// Whether the ECUs have identifiers of 29 bits.
-    is_extended: bool,
+    vehicle: Vehicle,
     /// What trouble codes mean, if the user has a table.
     texts: Option<CodeTexts>,
     /// Takes the answers, if they are not printed one by one.
     table: Option<Table>,
     /// Where the table is left by a key.
     keyboard: Option<Keyboard>,
-    servers: Vec<Server>,
 }
 
-impl Vehicle<'_> {
+impl Asker<'_> {
     /// Finds out which ECUs answer.
     fn find(&mut self) -> anyhow::Result<()> {
-        for (services, extended) in
-            [(Services::Own, false), (Services::Own, true), (Services::OnUds, false), (Services::OnUds, true)]
-        {
-            self.client.set_transfer(transfer(extended, self.p2));
-            for answer in self.client.ask_unknown(&services.value(0))? {
-                if let Some(bits) = services.bits(0, &answer.data) {
-                    self.servers.push(Server { answers_with: answer.from, pids: listed(0, bits) });
-                }
-            }
-            if !self.servers.is_empty() {
-                (self.services, self.is_extended) = (services, extended);
-                self.client.set_servers(self.servers.iter().map(|server| server.answers_with).collect());
-                return Ok(());
-            }
+        while let Some(request) = self.vehicle.search() {
+            self.client.set_transfer(self.vehicle.transfer());
+            self.vehicle.take_search(&self.client.ask_unknown(&request)?);
         }
-        Err(anyhow!(
-            "no ECU answers, neither to 7DF nor to 18DB33F1, by OBD-II's own services or over UDS; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
-             or 250k; --p2 waits longer",
-            self.client.speaking.circumstances()
-        ))
+        let servers = self.vehicle.servers();
+        if servers.is_empty() {
+            bail!(
+                "no ECU answers, neither to 7DF nor to 18DB33F1, by OBD-II's own services or over UDS; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
+                 or 250k; --p2 waits longer",
+                self.client.speaking.circumstances()
+            );
+        }
+        self.client.set_servers(servers);
+        Ok(())
     }
 
     /// Reads the lists after the first one, as far as they go.
     fn lists(&mut self) -> anyhow::Result<()> {
-        for base in (LIST..=0xE0).step_by(usize::from(LIST)) {
-            let servers = self.having(base);
-            if servers == 0 {
-                break;
-            }
-            for answer in self.client.ask_whoever(&self.services.value(base), Some(servers))? {
-                let Some(bits) = self.services.bits(base, &answer.data) else { continue };
-                if let Some(server) =
-                    self.servers.iter_mut().find(|server| server.answers_with == answer.from)
-                {
-                    server.pids.extend(listed(base, bits));
-                }
-            }
+        while let Some((request, servers)) = self.vehicle.list() {
+            self.vehicle.take_list(&self.client.ask_whoever(&request, Some(servers))?);
         }
         Ok(())
     }
 
-    /// The number of ECUs that have a parameter.
-    fn having(&self, pid: u8) -> usize {
-        self.servers.iter().filter(|server| server.pids.contains(&pid)).count()
-    }
-
     fn show_lists(&self) -> anyhow::Result<()> {
         let mut out = std::io::stdout().lock();
-        let mut all: BTreeMap<u8, Vec<String>> = BTreeMap::new();
-        for server in &self.servers {
-            for pid in server.pids.iter().filter(|pid| !pid.is_multiple_of(LIST)) {
-                all.entry(*pid).or_default().push(server.answers_with.to_string());
-            }
-        }
-        for (pid, servers) in all {
+        for (pid, servers) in self.vehicle.parameters() {
             let name = parameter_name(pid).unwrap_or("(no name known)");
+            let servers: Vec<_> = servers.iter().map(ToString::to_string).collect();
             writeln!(out, "{pid:02X}  {name:<40}  {}", servers.join(", "))?;
         }
         Ok(())
@@ -300,7 +223,7 @@ impl Vehicle<'_> {
     /// Prints the wanted events of what was asked here, or puts them into the table.
     fn show(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> std::io::Result<()> {
         let Some(table) = &mut self.table else { return self.client.show_if(is_wanted) };
-        let options = transfer(self.is_extended, self.p2);
+        let options = self.vehicle.transfer();
         let events = self.client.speaking.take_events();
         events
             .iter()
@@ -339,7 +262,7 @@ impl Vehicle<'_> {
         self.client.speaking.take_events();
         let Polling { pids: wanted, period, count } = polling;
         let pids = if wanted.is_empty() { self.all_pids() } else { wanted.clone() };
-        if let Some(pid) = pids.iter().find(|pid| self.having(**pid) == 0) {
+        if let Some(pid) = pids.iter().find(|pid| self.vehicle.having(**pid) == 0) {
             bail!("no ECU has the parameter {pid:02X}; `cantap obd supported` shows those that there are");
         }
         let started = Instant::now();
@@ -389,19 +312,15 @@ impl Vehicle<'_> {
     }
 
     fn all_pids(&self) -> Vec<u8> {
-        let all = self.servers.iter().flat_map(|server| server.pids.iter().copied());
-        let mut pids: Vec<u8> = all.filter(|pid| !pid.is_multiple_of(LIST)).collect();
-        pids.sort_unstable();
-        pids.dedup();
-        pids
+        self.vehicle.parameters().into_keys().collect()
     }
 
     /// Shows values, and returns those parameters for which there was an answer.
     fn values(&mut self, pids: &[u8]) -> anyhow::Result<Vec<u8>> {
         let mut answered = Vec::new();
         for pid in pids {
-            let servers = self.having(*pid);
-            let asked = self.client.ask_whoever(&self.services.value(*pid), Some(servers));
+            let servers = self.vehicle.having(*pid);
+            let asked = self.client.ask_whoever(&self.vehicle.services().value(*pid), Some(servers));
             if interrupt::requested() {
                 return Ok(answered);
             }
@@ -421,8 +340,8 @@ impl Vehicle<'_> {
     fn codes(&mut self) -> anyhow::Result<()> {
         let mut any = false;
         let mut codes = BTreeSet::new();
-        for (kind, request) in self.services.codes() {
-            let answers = self.client.ask_whoever(request, Some(self.servers.len()))?;
+        for (kind, request) in self.vehicle.services().codes() {
+            let answers = self.client.ask_whoever(request, Some(self.vehicle.servers().len()))?;
             let sid = f64::from(request[0]);
             self.show(|event| {
                 let is_wanted = is_answer(event)
@@ -451,7 +370,7 @@ impl Vehicle<'_> {
 
     fn identification(&mut self) -> anyhow::Result<()> {
         let mut any = false;
-        let requests = self.services.identification();
+        let requests = self.vehicle.services().identification();
         let sid = f64::from(requests[0][0]);
         // What was asked to find the ECUs may be of the same service.
         self.client.speaking.take_events();

@@ -255,3 +255,19 @@ fn a_watched_table_is_drawn_over_the_one_before() {
     view.keys("q");
     assert_eq!(view.end(), 0);
 }
+
+/// Found as a newcomer: after Ctrl-Z, a pause and `fg`, the device had "not answered within 2 s".
+#[cfg(unix)]
+#[test]
+fn a_table_of_values_that_was_stopped_for_a_while_goes_on() {
+    let mut view = Terminal::start("obd -d virtual:car watch 0C 0D --period 50ms", (80, 24));
+    view.wait_for("engine_speed");
+    view.signal("STOP");
+    // Longer than a device may take to answer.
+    std::thread::sleep(std::time::Duration::from_secs(3));
+    view.signal("CONT");
+    let before = view.text();
+    view.wait_until("other values", |screen| screen != before && screen.contains("engine_speed"));
+    view.keys("q");
+    assert_eq!(view.end(), 0, "{}", view.text());
+}

@@ -48,6 +48,7 @@ mod mcap;
 mod message_names;
 mod misbehaving_devices;
 mod monitor_keys;
+mod monitor_obd;
 mod monitor_replug;
 mod monitor_screens;
 mod monitor_scripts;

@@ -76,3 +76,33 @@ fn a_range_is_for_a_trace_and_not_for_a_device() {
         assert_eq!(code, Some(2), "{command}: {err}");
     }
 }
+
+/// Found as a newcomer: an empty trace was written, or no frames were counted, without a word.
+#[test]
+fn a_range_in_which_there_is_nothing_is_told_from_a_trace_without_traffic() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("trace.log");
+    fs::write(&path, "(10.0) can0 100#\n(12.5) can0 200#\n").unwrap();
+    let trace = path.to_str().unwrap();
+    let nowhere = Path::new("/dev/null");
+    for command in [&["convert", trace, "-"][..], &["stats", trace], &["search", trace, "--id", "100"]] {
+        let (_, _, err) = cantap_in(nowhere, &[command, &["--start", "1m"]].concat());
+        let expected =
+            "no record is between --start and --end; the trace's last one is 2.500 s after its first";
+        assert!(err.contains(expected), "{command:?}: {err}");
+        let (_, _, err) = cantap_in(nowhere, &[command, &["--start", "2"]].concat());
+        assert_eq!(err, "", "{command:?}");
+        let (code, _, err) = cantap_in(nowhere, &[command, &["--start", "10", "--end", "5"]].concat());
+        assert!(code == Some(2) && err.contains("the end is not after the start"), "{command:?}: {err}");
+    }
+}
+
+/// Found as a newcomer: the identifier 7E8 was a number that is true for every frame.
+#[test]
+fn an_identifier_in_place_of_a_condition_is_explained() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("trace.log");
+    fs::write(&path, "(10.0) can0 100#\n").unwrap();
+    let (code, out, err) = cantap_in(Path::new("/dev/null"), &["search", path.to_str().unwrap(), "7E8"]);
+    assert!(code == Some(2) && out.is_empty() && err.contains("id == 0x7E8"), "{out}{err}");
+}

@@ -51,6 +51,14 @@ pub(crate) trait Decode: Send {
         None
     }
 
+    /// Once records were read: appends what was found out about the whole file that a reading from another place can use. False if there is nothing.
+    fn save_layout(&self, _layout: &mut Vec<u8>) -> bool {
+        false
+    }
+
+    /// Takes up what [`Self::save_layout`] appended for the same file, before anything is read.
+    fn restore_layout(&mut self, _layout: &[u8]) {}
+
     /// How far the reading has come in a file that is read at many places: it grows with whatever is handed out. `None` if the file is read from its
     /// beginning to its end.
     fn position(&self) -> Option<u64> {

@@ -17,6 +17,7 @@ mod field;
 mod formula;
 mod joined;
 mod layout;
+mod map;
 mod order;
 mod part;
 mod place;

@@ -88,6 +88,11 @@ impl TimeRange {
         self.start.is_none() && self.end.is_none()
     }
 
+    /// The time of the trace's first record in nanoseconds, as far as it is known.
+    pub const fn first_ns(&self) -> Option<i64> {
+        self.first_ns
+    }
+
     /// Whether a record is in it. The first record passed is taken as the trace's first.
     pub fn contains(&mut self, record: &TraceRecord) -> bool {
         let first_ns = *self.first_ns.get_or_insert(record.time_ns);

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::io::Write;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -12,6 +12,7 @@ use cantap_wire::{Command, Refusal, Reply, Request};
 use super::error::{DeviceError, Gone};
 use super::link::is_idle;
 use super::plausible::believe;
+use super::watch::LONGEST_PASS;
 
 /// A device makes the host wait while it has no room; one that accepts nothing for this long is stuck.
 const WRITE_PATIENCE: Duration = Duration::from_secs(2);
@@ -257,7 +258,7 @@ impl<N> InFlight<'_, N> {
 
     /// The same, but the answer as it comes. An error says why there is none.
     pub fn answer_within(self, timeout: Duration) -> Result<Answer, DeviceError> {
-        self.answers.recv_timeout(timeout).map_err(|_| {
+        while_listening(timeout, |piece| self.answers.recv_timeout(piece)).map_err(|_| {
             self.requests.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() })
         })
     }
@@ -266,6 +267,21 @@ impl<N> InFlight<'_, N> {
 impl<N> Drop for InFlight<'_, N> {
     fn drop(&mut self) {
         self.requests.forget(self.id);
+    }
+}
+
+/// Receives something, waiting for this long by pieces, however long each takes: while this program stood still, as after Ctrl-Z, nobody was listening to
+/// the device, which may have answered long ago.
+fn while_listening<T>(
+    mut left: Duration,
+    mut receive: impl FnMut(Duration) -> Result<T, RecvTimeoutError>,
+) -> Result<T, RecvTimeoutError> {
+    loop {
+        let piece = left.min(LONGEST_PASS);
+        match receive(piece) {
+            Err(RecvTimeoutError::Timeout) if left > piece => left -= piece,
+            received => return received,
+        }
     }
 }
 
@@ -302,4 +318,32 @@ pub fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
     let encoded = framing::encode(request, &mut message, &mut out).ok_or(DeviceError::RequestTooLong)?;
     out.truncate(encoded);
     Ok(out)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// After Ctrl-Z and three seconds, a device that was there was not to have answered.
+    #[test]
+    fn the_time_in_which_the_program_stood_still_is_not_the_devices() {
+        let after = |pieces: u32, timeout: Duration| {
+            let (mut count, mut listened) = (0, Duration::ZERO);
+            let received = while_listening(timeout, |piece| {
+                listened += piece;
+                count += 1;
+                // However long this piece really took.
+                if count > pieces { Ok(()) } else { Err(RecvTimeoutError::Timeout) }
+            });
+            (received, listened)
+        };
+        let two = Duration::from_secs(2);
+        assert_eq!(after(0, two), (Ok(()), LONGEST_PASS));
+        assert_eq!(after(19, two), (Ok(()), two));
+        assert_eq!(after(20, two), (Err(RecvTimeoutError::Timeout), two));
+        let short = LONGEST_PASS + Duration::from_millis(7);
+        assert_eq!(after(9, short), (Err(RecvTimeoutError::Timeout), short));
+        let gone = while_listening(two, |_| Err::<(), _>(RecvTimeoutError::Disconnected));
+        assert_eq!(gone, Err(RecvTimeoutError::Disconnected));
+    }
 }

@@ -8,6 +8,7 @@
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`odx`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
+//! | [`obd`] | a vehicle's parameters: who has which, asked again and again, as a table |
 //! | [`changing`], [`disturbance`] | messages whose values change with time; error frames on purpose |
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
@@ -64,6 +65,8 @@ mod meter;
 pub mod missing;
 #[cfg(feature = "buses")]
 pub mod node_text;
+#[cfg(feature = "buses")]
+pub mod obd;
 #[cfg(feature = "buses")]
 pub mod odx;
 #[cfg(target_os = "linux")]

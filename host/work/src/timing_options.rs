@@ -4,14 +4,14 @@ use cantap::Channel;
 use cantap::bit_timing::{TimingError, TimingRequest};
 use cantap::wire::{BitTiming, CHANNELS};
 
-use crate::channel_bitrate::ChannelBitrate;
+use crate::channel_bitrate::{AUTO, ChannelBitrate};
 use crate::channels::{MOST_CHANNELS, place_of};
 use crate::requested_rate::RequestedRate;
 
 /// A bit timing, as far as it is given.
 #[derive(Clone, Debug, Default)]
 pub struct TimingOptions {
-    /// Bit rates; the last one for a channel counts.
+    /// Bit rates, at most one for a channel and one for all others.
     pub bitrates: Vec<RequestedRate>,
     /// The sample point in per cent of the bit, instead of the one that CiA recommends.
     pub sample_point: Option<f64>,
@@ -44,6 +44,18 @@ pub enum TimingOptionsError {
         count: usize,
         /// From 1.
         number: u8,
+    },
+    /// Different bit rates for the same channel, or for all: whoever means one for each would take part in a bus at the wrong one.
+    #[error(
+        "two bit rates for {of}, {first} and {second}; one for each channel is written -b 1:{first} -b 2:{second}"
+    )]
+    Twice {
+        /// Which channel.
+        of: String,
+        /// What was requested first.
+        first: String,
+        /// What was requested then.
+        second: String,
     },
     /// A sample point or a jump width, and no bit rate.
     #[error("a sample point or jump width needs a bit rate; add -b RATE")]
@@ -95,8 +107,18 @@ impl TimingOptions {
         (1..=MOST_CHANNELS).filter_map(of).collect()
     }
 
-    /// Refuses bit rates of channels that this number of boards does not have.
+    /// Refuses bit rates of channels that this number of boards does not have, and different ones for the same channel.
     pub fn check_channels(&self, boards: usize) -> Result<(), TimingOptionsError> {
+        for (place, rate) in self.bitrates.iter().enumerate() {
+            let same = |other: &&RequestedRate| other.channel == rate.channel && *other != rate;
+            let Some(second) = self.bitrates[place..].iter().find(same) else { continue };
+            let text = |rate: &RequestedRate| {
+                rate.bitrate_bps.map_or_else(|| AUTO.to_owned(), |bitrate_bps| bitrate_bps.to_string())
+            };
+            let of =
+                rate.channel.map_or_else(|| "all channels".to_owned(), |number| format!("channel {number}"));
+            return Err(TimingOptionsError::Twice { of, first: text(rate), second: text(second) });
+        }
         let count = boards * CHANNELS;
         let named = self.bitrates.iter().filter_map(|rate| rate.channel);
         let Some(number) = named.into_iter().find(|number| usize::from(*number) > count) else {
@@ -153,6 +175,36 @@ impl TimingOptions {
             }
             None if sample_point.is_some() || sjw.is_some() => Err(TimingOptionsError::NoBitRate),
             None => Ok(None),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Found as a newcomer: the last one counted, and the first channel took part at the second one's bit rate.
+    #[test]
+    fn two_bit_rates_for_the_same_channels_are_refused() {
+        let check = |texts: &[&str]| {
+            let bitrates = texts.iter().map(|text| text.parse().unwrap()).collect();
+            let options = TimingOptions { bitrates, ..TimingOptions::default() };
+            options.check_channels(1).map_err(|error| error.to_string())
+        };
+        assert_eq!(
+            check(&["500k", "250k"]),
+            Err("two bit rates for all channels, 500000 and 250000; one for each channel is written -b 1:500000 -b 2:250000"
+                .to_owned())
+        );
+        assert!(
+            check(&["2:auto", "500k", "2:250k"])
+                .unwrap_err()
+                .starts_with("two bit rates for channel 2, auto and 250000")
+        );
+        for fine in
+            [&["500k"][..], &["500k", "2:250k"], &["1:500k", "2:250k"], &["500k", "500k"], &["auto", "2:1M"]]
+        {
+            assert_eq!(check(fine), Ok(()), "{fine:?}");
         }
     }
 }

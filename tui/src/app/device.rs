@@ -9,7 +9,7 @@ use super::super::model::{LOAD_WINDOW, Model};
 use super::super::order::Order;
 use super::super::plan::Plan;
 use super::line::PromptKind;
-use super::state::App;
+use super::state::{App, View};
 use cantap_work::advice;
 use cantap_work::requested_rate::RequestedRate;
 
@@ -29,6 +29,9 @@ impl App {
             KeyCode::Char('y' | 'Y') => {
                 self.prompt = None;
                 self.set_mode(Mode::Normal);
+                if self.view == View::Obd {
+                    self.order(Order::Ask(true));
+                }
             }
             KeyCode::Char('n' | 'N') | KeyCode::Esc | KeyCode::Enter => {
                 self.prompt = None;

@@ -60,15 +60,16 @@ impl App {
             KeyCode::Char('q') => return Flow::Quit,
             KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
             KeyCode::Char(digit @ '1'..='9') => self.show(View::ALL[digit as usize - '1' as usize]),
-            KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
-            KeyCode::BackTab => {
-                self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
-            }
-            KeyCode::Char(' ') if self.view == View::Send => self.toggle_sending(),
-            KeyCode::Char(' ') if self.view == View::Scripts => self.toggle_script(model),
+            KeyCode::Char('0') => self.open_vehicle(model),
+            KeyCode::Tab => self.show(self.view.beside(true)),
+            KeyCode::BackTab => self.show(self.view.beside(false)),
+            // On every page, as its last line says.
             KeyCode::Char(' ') if matches!(model.source, SourceState::Playing(_)) => {
                 self.toggle_playback(model);
             }
+            KeyCode::Char(' ') if self.view == View::Send => self.toggle_sending(),
+            KeyCode::Char(' ') if self.view == View::Scripts => self.toggle_script(model),
+            KeyCode::Char(' ') if self.view == View::Obd => self.toggle_asking(model),
             KeyCode::Char(' ') => self.pause(model),
             KeyCode::Char('c') => self.clear(model),
             KeyCode::Char('t') => self.time_mode = self.time_mode.next(),
@@ -260,8 +261,10 @@ impl App {
     fn click(&mut self, event: MouseEvent, model: &Model) {
         if event.row == 0 {
             let tab = self.tab_columns.iter().find(|(columns, _)| columns.contains(&event.column));
-            if let Some(view) = tab.map(|(_, view)| *view) {
-                self.show(view);
+            match tab.map(|(_, view)| *view) {
+                Some(View::Obd) => self.open_vehicle(model),
+                Some(view) => self.show(view),
+                None => {}
             }
             return;
         }
@@ -272,8 +275,9 @@ impl App {
         if event.row == BODY_ROW {
             return self.click_heading(event.column);
         }
-        // A page begins with a heading; that of the send list is below a sentence.
-        let body_row = BODY_ROW + if matches!(self.view, View::Send | View::Scripts) { 2 } else { 1 };
+        // A page begins with a heading; that of the send list is below what is said.
+        let is_list = matches!(self.view, View::Send | View::Scripts);
+        let body_row = if is_list { self.rows_at } else { BODY_ROW + 1 };
         let Some(row) = event.row.checked_sub(body_row).map(usize::from).filter(|row| *row < self.page_rows)
         else {
             return;
@@ -289,7 +293,7 @@ impl App {
                     self.cursor = Some(place);
                 }
             }
-            View::Graph | View::Statistics | View::Record | View::Nodes => {}
+            View::Graph | View::Statistics | View::Record | View::Nodes | View::Obd => {}
         }
     }
 }

@@ -17,6 +17,7 @@ mod search;
 mod sending;
 mod signals;
 mod state;
+mod vehicle;
 
 use std::sync::Arc;
 

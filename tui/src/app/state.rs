@@ -41,11 +41,13 @@ pub enum View {
     Nodes,
     /// Scripts, and the device's gateway.
     Scripts,
+    /// What a vehicle answers by OBD-II.
+    Obd,
 }
 
 impl View {
-    /// In the order of their keys.
-    pub const ALL: [View; 9] = [
+    /// In the order of their keys: 1 to 9, and 0.
+    pub const ALL: [View; 10] = [
         View::Trace,
         View::Fixed,
         View::Signals,
@@ -55,7 +57,21 @@ impl View {
         View::Record,
         View::Nodes,
         View::Scripts,
+        View::Obd,
     ];
+    /// How many of them follow each other by Tab: the last one asks a vehicle, which only its own key or tab may begin.
+    const BY_TAB: usize = Self::ALL.len() - 1;
+
+    /// The page that follows this one by Tab, or precedes it.
+    pub(super) const fn beside(self, is_next: bool) -> Self {
+        let step = if is_next { 1 } else { Self::BY_TAB - 1 };
+        let place = match (self, is_next) {
+            (Self::Obd, true) => Self::BY_TAB - 1,
+            (Self::Obd, false) => 0,
+            _ => self as usize,
+        };
+        Self::ALL[(place + step) % Self::BY_TAB]
+    }
 
     /// The text of its tab.
     pub const fn title(self) -> &'static str {
@@ -69,6 +85,7 @@ impl View {
             Self::Record => "Record",
             Self::Nodes => "Nodes",
             Self::Scripts => "Scripts",
+            Self::Obd => "OBD",
         }
     }
 }
@@ -139,6 +156,8 @@ pub struct App {
     pub signal_order: Vec<Option<usize>>,
     /// Number of rows that fit on the page, as last drawn.
     pub page_rows: usize,
+    /// Where on the screen the first row of a list is, as last drawn.
+    pub rows_at: u16,
     /// The graph's view of time.
     pub graph: Graph,
     /// Frames to send.
@@ -234,6 +253,7 @@ impl App {
             fixed_order: Vec::new(),
             signal_order: Vec::new(),
             page_rows: 20,
+            rows_at: 0,
             graph: Graph::default(),
             send: Vec::new(),
             help: false,
@@ -265,6 +285,8 @@ impl App {
 
     pub(super) fn show(&mut self, view: View) {
         if self.view != view {
+            // Leaving the page ends the asking.
+            self.set_aside();
             self.view = view;
             self.selected = 0;
         }

@@ -8,6 +8,7 @@ pub mod scripts;
 pub mod series;
 pub mod signals;
 mod talk;
+mod vehicle;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,6 +21,7 @@ use cantap_analysis::stats::{Options, Statistics, Window};
 use cantap_signals::Decoder;
 
 use super::plan::Plan;
+use cantap_work::obd::Table;
 use cantap_work::reception::Reception;
 use cantap_work::recording::RecordingState;
 
@@ -29,6 +31,7 @@ pub use scripts::{LineKind, ScriptState, Scripts};
 pub use series::{Extent, Point, Series};
 pub use signals::{Decoded, SignalRow, SignalTable};
 pub use talk::{Talk, Talked};
+pub use vehicle::VehicleSeen;
 
 /// Length of the windows in the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
@@ -150,6 +153,8 @@ pub struct Model {
     pub recording: Option<RecordingState>,
     /// Scripts, and the device's gateway.
     pub scripts: Scripts,
+    /// What a vehicle answers, if it is asked.
+    pub vehicle: VehicleSeen,
     /// The latest message for the user.
     pub notice: String,
     talk: Talk,
@@ -184,6 +189,7 @@ impl Model {
             unread: None,
             recording: None,
             scripts: Scripts::default(),
+            vehicle: VehicleSeen::default(),
             notice: String::new(),
             talk: Talk::default(),
             options,
@@ -240,6 +246,7 @@ impl Model {
         self.seen.signals.clear();
         (self.talk, self.seen.talked) = (Talk::default(), Talked::default());
         self.scripts.output.clear();
+        self.vehicle.table = Table::default();
         self.seen.taken = 0;
         self.first_ns = None;
         self.counted_from_ns = None;

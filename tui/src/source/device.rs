@@ -57,6 +57,7 @@ impl Source<'_> {
             }
             let board = lines.lines().nth(BOARD).and_then(Line::device);
             self.forget_scripts(board, "its session with the device is over");
+            self.forget_asking("the session with the device is over");
             if lines.devices().next().is_some() {
                 self.end(&mut lines);
                 if !matches!(then, Then::Quit) {
@@ -99,7 +100,8 @@ impl Source<'_> {
         self.timed = Timed::default();
         lock(self.model).source = SourceState::Starting;
         loop {
-            let wait = if self.scripts.are_running() { SCRIPTS_WAIT } else { WAIT };
+            let is_awaited = self.scripts.are_running() || self.awaits_an_answer();
+            let wait = if is_awaited { SCRIPTS_WAIT } else { WAIT };
             match lines.next(wait) {
                 (_, Happening::Records(batch)) => self.hand_over(batch, lines),
                 (board, Happening::Gone(error)) => {
@@ -108,6 +110,7 @@ impl Source<'_> {
                     let reason = advice::sentence(&error);
                     if board == BOARD {
                         self.forget_scripts(None, &reason);
+                        self.forget_asking("the device is gone");
                     }
                     let mut model = lock(self.model);
                     if lines.devices().next().is_none() {
@@ -145,6 +148,7 @@ impl Source<'_> {
             let scripts_on = lines.lines().nth(BOARD).and_then(Line::device);
             if let Some(device) = scripts_on {
                 self.serve_scripts(device);
+                self.go_on_asking(device);
             }
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;
@@ -162,7 +166,8 @@ impl Source<'_> {
                         order @ (Order::Send(..)
                         | Order::SetPeriodic(..)
                         | Order::StartScript(_)
-                        | Order::StopScript(_)),
+                        | Order::StopScript(_)
+                        | Order::Ask(_)),
                     ) if !is_known => {
                         early.push_back(order);
                         Then::GoOn
@@ -261,7 +266,9 @@ impl Source<'_> {
         };
         model.source = SourceState::Running;
         model.sessions[board] += 1;
-        model.met_car |= hello.board == cantap_virtual::car::BOARD;
+        let is_car = hello.board == cantap_virtual::car::BOARD;
+        model.met_car |= is_car;
+        model.vehicle.is_there |= is_car;
         let rates =
             opened.iter().map(|(number, config, clock_hz)| (*number, config.timing.bitrate_bps(*clock_hz)));
         let rates: Vec<_> = rates.collect();
@@ -305,6 +312,10 @@ impl Source<'_> {
             (Order::StartScript(script), None) => {
                 let reason = "its device is gone; start it when it is back";
                 lock(self.model).scripts.fail(&script.name, reason);
+                return Then::GoOn;
+            }
+            (Order::Ask(on), device) => {
+                self.ask(device, on);
                 return Then::GoOn;
             }
             (Order::StopScript(name), _) => {
@@ -417,6 +428,7 @@ impl Source<'_> {
             self.take(&batch);
         }
         self.scripts.take(&batch);
+        self.show_to_asking(&batch);
         let mut model = lock(self.model);
         let now = Instant::now();
         model.reception.take(&batch, now);

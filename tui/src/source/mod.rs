@@ -3,6 +3,7 @@
 //! It holds the model's lock only to hand over what it has, so that the display cannot delay it; a device's
 //! buffer in the library covers slow moments.
 
+mod asking;
 mod autobaud;
 mod device;
 mod playback;
@@ -24,6 +25,7 @@ use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
 use cantap_work::cache;
+use cantap_work::obd::Asking;
 use cantap_work::recording::{Older, Recording};
 use session_scripts::SessionScripts;
 use timed::Timed;
@@ -55,7 +57,7 @@ enum Then {
 
 /// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
-/// The same while scripts run: what they want of the device waits no longer.
+/// The same while scripts run or an answer is awaited: what they want of the device waits no longer.
 const SCRIPTS_WAIT: Duration = Duration::from_millis(1);
 /// How often to ask for the device's state, and to flush a recording.
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
@@ -68,6 +70,7 @@ pub fn run(origin: Origin, model: &Shared, orders: &Receiver<Order>) {
         recording: None,
         timed: Timed::default(),
         scripts: SessionScripts::default(),
+        asking: None,
         indexes: cache::indexes(),
     };
     match origin {
@@ -83,6 +86,8 @@ struct Source<'a> {
     recording: Option<Recording>,
     timed: Timed,
     scripts: SessionScripts,
+    /// Questions to a vehicle.
+    asking: Option<Asking>,
     /// Where those of large files are kept.
     indexes: Option<IndexFolder>,
 }
@@ -183,6 +188,7 @@ impl Source<'_> {
                     .scripts
                     .fail(&script.name, "there is no device to run it on; open one with D");
             }
+            Order::Ask(on) => self.ask(None, on),
             Order::StopScript(_) | Order::ScriptKey(_) => {}
             Order::WriteList(path, text) => self.write_list(&path, &text),
             Order::Recover => self.notice("there is no device to bring back onto a bus"),

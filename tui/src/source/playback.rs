@@ -56,11 +56,13 @@ const MOST_READ: u64 = 500_000;
 
 impl Readable {
     /// Opens the file at its beginning, or goes on with a jump, and forgets earlier counts.
-    fn open(path: &Path, progress: &Rc<Progress>) -> Result<Self, OpenError> {
+    fn open(path: &Path, indexes: Option<&IndexFolder>, progress: &Rc<Progress>) -> Result<Self, OpenError> {
         if let Some(jump) = progress.jump.take() {
             return Ok(jump);
         }
-        let reader = open_reader(path, &ReadOptions::default())?;
+        // The first screen of a file of many blocks is there at once, too, if they are known.
+        let index = indexes.map(|indexes| indexes.clone().only_used());
+        let reader = open_reader(path, &ReadOptions { index, ..ReadOptions::default() })?;
         progress.unread.take();
         Ok(Self { reader, progress: Rc::clone(progress), first: Vec::new(), from_ns: i64::MIN })
     }
@@ -194,7 +196,8 @@ impl Source<'_> {
     pub(super) fn run_file(&mut self, path: &Path) {
         let progress = Rc::default();
         let start = Instant::now();
-        let playback = Playback::new(|| Readable::open(path, &progress), start.elapsed());
+        let indexes = self.indexes.clone();
+        let playback = Playback::new(|| Readable::open(path, indexes.as_ref(), &progress), start.elapsed());
         match playback {
             Ok(playback) => self.play(path, playback, &progress, start),
             Err(error) => {

@@ -4,10 +4,10 @@ use cantap::TraceRecord;
 use cantap::wire::message::Mode;
 use cantap_analysis::stats::Options;
 use cantap_signals::Decoder;
-use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::app::{Flow, TimeMode, View};
-use super::super::model::Model;
+use super::super::model::{Model, Playing, SourceState};
 use super::super::order::Order;
 use super::{app, model, press, screen_text};
 
@@ -447,4 +447,40 @@ fn a_key_that_was_pressed_to_continue_does_nothing_else() {
     assert!(!text.contains("any key continues"), "{text}");
     press(&mut app, &mut model, "1");
     assert_eq!(app.view, View::Trace);
+}
+
+/// Found as a newcomer: at 40 columns the key that the sentence names was cut off.
+#[test]
+fn the_way_out_of_listening_only_is_in_sight_however_narrow_the_screen() {
+    let mut model = model();
+    for view in [View::Send, View::Scripts, View::Obd] {
+        let (mut app, _orders) = app(view);
+        let text = screen_text(&mut app, &model, (40, 12)).unwrap();
+        let words = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        assert!(words.contains("m takes part in the bus"), "{text}");
+    }
+    // A click still finds its row.
+    let (mut app, _orders) = app(View::Send);
+    press(&mut app, &mut model, "a123#11\na124#11\n");
+    let text = screen_text(&mut app, &model, (40, 12)).unwrap();
+    let row = text.lines().position(|line| line.contains("124#11")).unwrap();
+    app.selected = 0;
+    let kind = MouseEventKind::Down(MouseButton::Left);
+    let click = MouseEvent { kind, column: 5, row: row as u16, modifiers: KeyModifiers::NONE };
+    app.mouse(click, &mut model);
+    assert_eq!(app.selected, 1, "{text}");
+}
+
+/// Found as a newcomer: the last line said that Space stops the file, and on some pages it did not.
+#[test]
+fn the_space_bar_stops_a_file_on_every_page() {
+    let mut model = model();
+    for view in View::ALL {
+        model.source = SourceState::Playing(Playing::default());
+        let (mut app, orders) = app(view);
+        app.plan = None;
+        assert!(screen_text(&mut app, &model, (80, 24)).unwrap().contains("Space stop"), "{view:?}");
+        press(&mut app, &mut model, " ");
+        assert!(matches!(orders.try_recv(), Ok(Order::TogglePause)), "{view:?}");
+    }
 }

@@ -9,6 +9,7 @@ mod help;
 mod keys;
 mod pages;
 mod random;
+mod vehicle;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -16,21 +17,24 @@ use std::sync::mpsc::Receiver;
 
 use cantap::device::ClockReport;
 use cantap::wire::BitTiming;
-use cantap::wire::message::{ChannelConfig, ChannelStatus, Status};
+use cantap::wire::message::{ChannelConfig, ChannelStatus, Mode, Status};
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
-use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap::{Channel, Direction, TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
 use cantap_formats::{ReadOptions, open_reader};
+use cantap_protocols::Assembler as _;
+use cantap_protocols::diagnostics::Diagnostics;
 use cantap_scripts::{Outcome, ScriptCounts, TestResult};
 use cantap_signals::{Decoder, Source};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::app::{App, Flow, View};
-use super::model::{DeviceFigures, LineKind, Model, ScriptState, Scripts, SourceState};
+use super::model::{DeviceFigures, LineKind, Model, ScriptState, Scripts, SourceState, VehicleSeen};
 use super::order::Order;
 use super::plan::Plan;
 use super::theme::Theme;
 use super::{orders, screen, text};
+use cantap_work::obd::{Asked, AskingState};
 use cantap_work::recording::RecordingState;
 
 use cantap_address::Address;
@@ -184,6 +188,40 @@ fn scripts(scripts: &mut Scripts) {
     scripts.gateway = gateway.map(str::to_owned).to_vec();
 }
 
+/// A vehicle in the second round: the gearbox's ECU does not answer for the speed any more.
+fn answers_of(vehicle: &mut VehicleSeen) {
+    let round = |answers: &[&str]| {
+        let (mut reader, mut events) = (Diagnostics::new(&[], false), Vec::new());
+        for (at, text) in answers.iter().enumerate() {
+            let time_ns = at as i64 * 1_000_000;
+            let record = TraceRecord { time_ns, device_ns: None, channel: 1, event: frame(text) };
+            reader.take(&record, &mut events);
+        }
+        let events = events.into_iter().filter(cantap_work::obd::is_answer).map(Asked::Answer);
+        std::iter::once(Asked::Round).chain(events).collect::<Vec<_>>()
+    };
+    vehicle.take(round(&[
+        "7DF#02010C5555555555",
+        "7E8#04410C0FA0000000",
+        "7DF#02010D5555555555",
+        "7E8#03410D3200000000",
+        "7E9#03410D3200000000",
+    ]));
+    vehicle.take(round(&[
+        "7DF#02010C5555555555",
+        "7E8#04410C1388000000",
+        "7DF#02010D5555555555",
+        "7E8#03410D3300000000",
+    ]));
+    vehicle.take(vec![Asked::State(AskingState::Asking {
+        channel: Channel::Can1,
+        ecus: "7E8, 7E9".to_owned(),
+        parameters: 2,
+        silent: String::new(),
+        is_shared: false,
+    })]);
+}
+
 /// A decoder from the text of a signal file.
 fn database(text: &str) -> Arc<Decoder> {
     let folder = tempfile::tempdir().unwrap();
@@ -241,6 +279,10 @@ fn check_page(view: View) {
     if view == View::Scripts {
         scripts(&mut model.scripts);
     }
+    if view == View::Obd {
+        answers_of(&mut model.vehicle);
+        app.plan.as_mut().unwrap().open.mode = Some(Mode::Normal);
+    }
     for size in SIZES {
         let name = format!("{}-{}x{}", view.title().to_lowercase(), size.0, size.1);
         check(&name, &screen_text(&mut app, &model, size).unwrap());
@@ -292,6 +334,12 @@ fn the_nodes_page_is_as_agreed() {
 #[test]
 fn the_scripts_page_is_as_agreed() {
     check_page(View::Scripts);
+}
+
+/// Two ECUs, one of which has stopped to answer one parameter.
+#[test]
+fn the_page_of_a_vehicle_is_as_agreed() {
+    check_page(View::Obd);
 }
 
 /// A transfer is shown until it is done, and a fault is visible.

@@ -181,6 +181,7 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",
         View::Nodes => "↑↓ scroll",
+        View::Obd => "Space ask or not  ↑↓ scroll  m mode",
         View::Scripts => "a add  e edit  d remove  Space start/stop  PgUp PgDn output  K key  m mode",
     };
     let playback = match model.source {
@@ -190,7 +191,11 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         _ => "",
     };
     let is_file = !playback.is_empty();
-    let pause = if matches!(app.view, View::Send | View::Scripts) || is_file { "" } else { "  Space pause" };
+    let pause = if matches!(app.view, View::Send | View::Scripts | View::Obd) || is_file {
+        ""
+    } else {
+        "  Space pause"
+    };
     let mut all = format!("h help  q quit  {playback}{keys}{pause}  c clear");
     if all.chars().count() > width {
         let ends = all.match_indices("  ").map(|(at, _)| at);

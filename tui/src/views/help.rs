@@ -11,10 +11,10 @@ use super::super::theme::Theme;
 
 /// Every key; `tests/help.rs` checks these against the keys that are handled.
 pub const KEYS: &[(&str, &str)] = &[
-    ("1 … 9, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
+    ("1 … 9, Tab  0", "pages: trace, fixed, signals, graph …; 0 asks a vehicle"),
     ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
     ("h ? F1", "this"),
-    ("Space", "stop or go on: display, file; send, scripts: entry on or off"),
+    ("Space", "stop or go on: display, file, OBD; send, scripts: on or off"),
     ("c  t", "clear; times: relative, delta, time of day (UTC)"),
     ("f", "show only some frames, by candump's filters or a condition"),
     ("/  n  N", "search this page, next, and the other way"),

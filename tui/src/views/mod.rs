@@ -6,6 +6,7 @@ pub mod graph;
 pub mod help;
 mod list;
 pub mod nodes;
+pub mod obd;
 pub mod record;
 pub mod scripts;
 pub mod send;
@@ -25,6 +26,7 @@ use super::app::{App, View};
 use super::cut::cut_line;
 use super::model::Model;
 use super::theme::Theme;
+use cantap_protocols::Protocol;
 
 /// The smallest usable screen.
 pub const LEAST: (u16, u16) = (40, 8);
@@ -44,7 +46,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         Constraint::Length(1),
     ])
     .areas(area);
-    let tabs = tabs(app, top.width.into());
+    let tabs = tabs(app, model, top.width.into());
     frame.render_widget(Paragraph::new(cut_line(tabs, top.width.into())).style(Theme::bar()), top);
     state::draw(frame, state, app, model);
     // While the display is paused, the pages show what had been seen then.
@@ -60,6 +62,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         View::Record => record::draw(frame, body, app, model),
         View::Nodes => nodes::draw(frame, body, app, model, seen),
         View::Scripts => scripts::draw(frame, body, app, model),
+        View::Obd => obd::draw(frame, body, app, model),
     }
     app.frozen = frozen;
     bottom::draw(frame, body, bottom, app, model);
@@ -89,6 +92,7 @@ fn make_ascii(buffer: &mut Buffer) {
             "↓" => "v",
             "×" => "x",
             "µ" => "u",
+            "°" => "o",
             // A point after a digit would be a decimal one.
             "…" => "~",
             "•" => "*",
@@ -98,33 +102,44 @@ fn make_ascii(buffer: &mut Buffer) {
     }
 }
 
-/// The pages. Where there is no room for all titles, the longest go, apart from the current page's.
-fn tabs(app: &mut App, width: usize) -> Line<'static> {
+/// Whether a vehicle is there that answers, as far as was heard.
+fn is_vehicle(model: &Model) -> bool {
+    let mut nodes = model.seen.talked.overview.nodes();
+    model.vehicle.is_there || nodes.any(|((_, protocol, _), _)| protocol == Protocol::Obd)
+}
+
+/// The pages. Where there is no room for all titles, the longest go, apart from the current page's; that of a vehicle goes first, if there is none.
+fn tabs(app: &mut App, model: &Model, width: usize) -> Line<'static> {
     let (this, all) = app.beside;
     let beside = if all > 1 { format!("w {this} of {all}") } else { String::new() };
     let mut titles = View::ALL.map(View::title);
     let text = |index: usize, titles: &[&str]| {
         let mark = if View::ALL[index] == app.view { '▸' } else { ' ' };
         if titles[index].is_empty() {
-            format!("{} ", index + 1)
+            format!("{} ", (index + 1) % 10)
         } else {
-            format!("{}{mark}{} ", index + 1, titles[index])
+            format!("{}{mark}{} ", (index + 1) % 10, titles[index])
         }
     };
-    loop {
-        let tabs = (0..titles.len()).map(|index| text(index, &titles).chars().count()).sum::<usize>();
-        // A blank at the end is not missed.
-        if tabs + beside.len() <= width + usize::from(beside.is_empty()) {
-            break;
-        }
-        let others = (0..titles.len()).filter(|index| View::ALL[*index] != app.view);
+    let length = |count: usize, titles: &[&str]| {
+        (0..count).map(|index| text(index, titles).chars().count()).sum::<usize>()
+    };
+    // A blank at the end is not missed.
+    let room = width + usize::from(beside.is_empty()) - beside.len();
+    let mut count = titles.len();
+    let is_wanted = app.plan.is_some() && (is_vehicle(model) || length(count, &titles) <= room);
+    if app.view != View::Obd && !is_wanted {
+        count -= 1;
+    }
+    while length(count, &titles) > room {
+        let others = (0..count).filter(|index| View::ALL[*index] != app.view);
         let longest =
             others.filter(|index| !titles[*index].is_empty()).max_by_key(|index| titles[*index].len());
         let Some(longest) = longest else { break };
         titles[longest] = "";
     }
     let (mut spans, mut columns, mut end) = (Vec::new(), Vec::new(), 0);
-    for (index, view) in View::ALL.into_iter().enumerate() {
+    for (index, view) in View::ALL.into_iter().enumerate().take(count) {
         let text = text(index, &titles);
         let begin = end;
         end += text.chars().count() as u16;

@@ -13,7 +13,7 @@ use super::super::model::scripts::ScriptRow;
 use super::super::model::{LineKind, Model, ScriptState};
 use super::super::theme::Theme;
 use super::bottom::wrapped;
-use super::list::list;
+use super::list::{list, said};
 
 /// Columns of a script's name.
 const NAME: usize = 28;
@@ -21,17 +21,6 @@ const NAME: usize = 28;
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let scripts = &model.scripts;
-    let rows = scripts.rows.len().max(1) as u16 + 1;
-    let gateway = scripts.gateway.len() as u16;
-    // The list and the gateway leave a third of the page to the output.
-    let most = area.height.saturating_sub(1) / 3;
-    let [state, body, output, rules] = Layout::vertical([
-        Constraint::Length(1),
-        Constraint::Length(rows.min(most.max(2))),
-        Constraint::Min(1),
-        Constraint::Length(gateway.min(most)),
-    ])
-    .areas(area);
     let (text, style) = match &app.plan {
         None => ("A file runs no scripts. Open a device with D.", app.theme.label()),
         Some(plan) if plan.mode().transmits() => {
@@ -42,7 +31,17 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             app.theme.label(),
         ),
     };
-    draw_lines(frame, state, vec![Line::styled(text, style)]);
+    let area = said(frame, area, text, style);
+    let rows = scripts.rows.len().max(1) as u16 + 1;
+    let gateway = scripts.gateway.len() as u16;
+    // The list and the gateway leave a third of the page to the output.
+    let most = area.height / 3;
+    let [body, output, rules] = Layout::vertical([
+        Constraint::Length(rows.min(most.max(2))),
+        Constraint::Min(1),
+        Constraint::Length(gateway.min(most)),
+    ])
+    .areas(area);
     if scripts.rows.is_empty() {
         let text = "The list is empty. a adds a script, or a ready node such as node:obd.";
         frame.render_widget(Paragraph::new(text).wrap(Wrap { trim: true }), body);

@@ -1,18 +1,16 @@
 //! Frames to send, once or periodically.
 
 use ratatui::Frame;
-use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::layout::Rect;
 use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
-use super::super::cut::draw_lines;
 use super::super::model::Seen;
-use super::list::list;
+use super::list::{list, said};
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
-    let [state, body] = Layout::vertical([Constraint::Length(1), Constraint::Min(1)]).areas(area);
     let (text, style) = match &app.plan {
         None => ("A file sends nothing. Open a device with D.", app.theme.label()),
         Some(plan) if plan.mode().transmits() => {
@@ -23,7 +21,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             app.theme.label(),
         ),
     };
-    draw_lines(frame, state, vec![Line::styled(text, style)]);
+    let body = said(frame, area, text, style);
     if app.send.is_empty() {
         let database = if seen.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
         let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");

@@ -1,11 +1,13 @@
-//! How much is measured on the emulated board.
+//! How much is measured.
 
 /// What to measure, and for how long.
 pub struct Extent<'a> {
     /// Only rows whose names contain this.
     pub rows: &'a str,
-    /// Measure for a tenth of the time.
+    /// Measure for a tenth of the time, or a fifth of the size.
     pub quick: bool,
+    /// How many times as long a trace is.
+    pub times: u64,
 }
 
 impl Extent<'_> {

@@ -24,6 +24,8 @@ mod host;
 #[cfg(feature = "bench")]
 mod memory;
 #[cfg(feature = "bench")]
+mod mf4_blocks;
+#[cfg(feature = "bench")]
 mod monitor;
 #[cfg(feature = "bench")]
 mod protocols;
@@ -91,12 +93,15 @@ pub struct Args {
     /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
-    /// Of the measurements on the emulated board, only the rows whose names contain this.
+    /// Of the measurements on the emulated board and of a large trace, only the rows whose names contain this.
     #[arg(long, value_name = "TEXT", default_value = "")]
     rows: String,
-    /// Measure on the emulated board for a tenth of the time: the figures are good enough to work with.
+    /// Measure on the emulated board for a tenth of the time, and a trace of a fifth of the size: the figures are good enough to work with.
     #[arg(long)]
     quick: bool,
+    /// How many times as long the large trace is: 10 makes 10 GB of candump log.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=20))]
+    times: u64,
 }
 
 /// Builds this program in release mode and measures with it.
@@ -110,9 +115,10 @@ pub fn run(args: &Args) -> Result<()> {
     let subjects: Vec<String> = subjects.map(|subject| subject.get_name().to_owned()).collect();
     let rows = &args.rows;
     let quick = args.quick.then_some("--quick");
+    let times = args.times.to_string();
     cmd!(
         shell,
-        "cargo run --release --quiet -p xtask --features bench -- bench {subjects...} --seconds {seconds} --rows {rows} {quick...}"
+        "cargo run --release --quiet -p xtask --features bench -- bench {subjects...} --seconds {seconds} --rows {rows} --times {times} {quick...}"
     )
     .quiet()
     .run()?;
@@ -124,13 +130,13 @@ pub fn run(args: &Args) -> Result<()> {
 pub fn run(args: &Args) -> Result<()> {
     use clap::ValueEnum;
 
-    let extent = extent::Extent { rows: &args.rows, quick: args.quick };
+    let extent = extent::Extent { rows: &args.rows, quick: args.quick, times: args.times };
     let subjects = if args.subject.is_empty() { Subject::value_variants() } else { &args.subject };
     for subject in subjects {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
-            Subject::Seek => seek::run(args.quick)?,
+            Subject::Seek => seek::run(&extent)?,
             Subject::Columns => columns::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,

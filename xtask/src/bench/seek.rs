@@ -9,13 +9,17 @@ use anyhow::{Result, ensure};
 use cantap_formats::{ReadOptions, open_reader};
 use xshell::{Shell, cmd};
 
+use super::extent::Extent;
 use super::formats::{RECORDING, make_trace};
+use super::mf4_blocks::in_blocks;
 use crate::workspace;
 
 /// Frames of the trace: a gigabyte as a candump log, and a fifth of it to try the benchmark.
 const FRAMES: [u64; 2] = [21_000_000, 4_200_000];
 /// Where to look, in thousandths of the trace's length.
 const PLACES: [u64; 7] = [500, 985, 20, 730, 250, 870, 120];
+/// Of the blocks of an MF4 file as some loggers write it.
+const SMALL_BLOCK_BYTES: u64 = 64 << 10;
 /// A second is to be there within this time, in seconds.
 const WITHIN: f64 = 0.3;
 /// After this time the system's time of a file's last change shows any other.
@@ -30,17 +34,18 @@ struct Trace {
 }
 
 /// Measures, and deletes the traces.
-pub fn run(quick: bool) -> Result<()> {
+pub fn run(extent: &Extent<'_>) -> Result<()> {
     let shell = workspace::shell()?;
     cmd!(shell, "cargo build --release --quiet -p cantap-cli").quiet().run()?;
     let folder = workspace::target().join("bench-seek");
     fs::create_dir_all(&folder)?;
-    let result = measure(&shell, &folder, FRAMES[usize::from(quick)]);
+    let result = measure(&shell, &folder, extent);
     fs::remove_dir_all(&folder)?;
     result
 }
 
-fn measure(shell: &Shell, folder: &Path, frames: u64) -> Result<()> {
+fn measure(shell: &Shell, folder: &Path, extent: &Extent<'_>) -> Result<()> {
+    let frames = FRAMES[usize::from(extent.quick)] * extent.times;
     let program = workspace::target().join("release/cantap");
     let log = folder.join("trace.log");
     make_trace(&workspace::root().join(RECORDING), &log, frames)?;
@@ -56,19 +61,30 @@ fn measure(shell: &Shell, folder: &Path, frames: u64) -> Result<()> {
         "index, MB"
     );
     let mut slow = Vec::new();
-    for suffix in ["log", "blf", "mf4", "asc", "trc", "pcapng", "csv"] {
+    for name in ["log", "blf", "mf4", "mf4-blocks", "asc", "trc", "pcapng", "csv"] {
+        if !extent.wants(name) {
+            continue;
+        }
+        let (suffix, blocks) = name.split_once('-').unwrap_or((name, ""));
         let path = log.with_extension(suffix);
         if path != log {
             cmd!(shell, "{program} convert {log} {path}").quiet().run()?;
         }
+        if !blocks.is_empty() {
+            let single = folder.join("single.mf4");
+            fs::rename(&path, &single)?;
+            let count = in_blocks(&single, &path, SMALL_BLOCK_BYTES)?;
+            println!("{name}: {count} blocks of {SMALL_BLOCK_BYTES} bytes");
+            fs::remove_file(&single)?;
+        }
         let trace = Trace {
             program: program.clone(),
             part: folder.join("part.log"),
-            cache: folder.join(format!("cache-{suffix}")),
+            cache: folder.join(format!("cache-{name}")),
             path,
         };
-        if trace.measure(shell, suffix)? > WITHIN {
-            slow.push(suffix);
+        if trace.measure(shell, name)? > WITHIN {
+            slow.push(name);
         }
         if trace.path != log {
             fs::remove_file(&trace.path)?;

@@ -6,6 +6,7 @@ use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::u32_at;
 use super::layout::{Apart, Elsewhere};
+use super::stream::Stream;
 
 /// Limit for records waiting for their bytes and bytes waiting for their records: if they are farther apart,
 /// the file is damaged.
@@ -42,6 +43,14 @@ pub(super) fn has_arrived(
 }
 
 impl Apart {
+    /// The stream that has the values, if they are in one.
+    pub(super) fn stream(&self) -> Option<&Stream> {
+        match &self.values {
+            Elsewhere::Stream(stream) => Some(stream),
+            Elsewhere::Group(_) => None,
+        }
+    }
+
     /// The value of a record, which has arrived.
     pub(super) fn take(
         &mut self,

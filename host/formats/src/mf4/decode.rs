@@ -1,7 +1,7 @@
 //! Reading MF4.
 
 use std::cmp::Reverse;
-use std::collections::{BinaryHeap, VecDeque};
+use std::collections::{BinaryHeap, HashMap, VecDeque};
 use std::io;
 
 use super::super::bit_rates::{self, BitRates};
@@ -15,7 +15,7 @@ use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, u16_at, u64_at};
 use super::comment::{BIT_RATES, Properties, properties};
 use super::joined::{after_blocks, joined};
-use super::layout::Alone;
+use super::map::{Map, Places};
 use super::order::Item;
 use super::part::{OPEN_LENGTH, Part, own};
 use super::place::{EVERY, Saved};
@@ -35,10 +35,16 @@ pub(crate) struct Decoder {
     bit_rates: BitRates,
     /// Where to go on, once the file is opened.
     resume: Option<Saved>,
+    /// What going through its blocks would find, if it is known before.
+    places: Option<Places>,
 }
 
 struct Opened {
     file: Whole,
+    /// Whether all of its blocks are known. Not of an unfinished file, in which another one may begin anywhere.
+    is_gone_through: bool,
+    /// Where another file begins behind it.
+    joined: Option<u64>,
     /// What was handed out.
     items: u64,
     parts: Vec<Part>,
@@ -85,6 +91,18 @@ impl Decode for Decoder {
         Some(())
     }
 
+    fn save_layout(&self, layout: &mut Vec<u8>) -> bool {
+        let open = self.open.as_ref().filter(|open| open.is_gone_through);
+        open.is_some_and(|open| {
+            seek::save(&Places::of(open.parts.iter().flat_map(Part::streams), open.joined), layout)
+        })
+    }
+
+    fn restore_layout(&mut self, layout: &[u8]) {
+        // Without it, the file is gone through.
+        self.places = seek::load(layout);
+    }
+
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
             match self.next(input)? {
@@ -116,10 +134,18 @@ impl Decoder {
     fn open(&mut self, input: &mut Input) -> io::Result<()> {
         let zone = input.zone().clone();
         let mut file = input.whole()?;
-        let (parts, fault) = match parts(&mut file, &zone, &mut self.first, &mut self.properties) {
-            Ok(parts) => (parts, None),
-            Err((parts, fault)) => (parts, Some(fault)),
+        let mut map = Map { places: self.places.take(), ..Map::default() };
+        let mut parts = Vec::new();
+        let mut collecting = Collecting {
+            map: &mut map,
+            first: &mut self.first,
+            properties: &mut self.properties,
+            is_resumed: self.resume.is_some(),
+            is_gone_through: false,
+            joined: None,
         };
+        let fault = collecting.collect(&mut file, &zone, &mut parts).err();
+        let Collecting { is_gone_through, joined, .. } = collecting;
         // It is for programs.
         if let Some(rates) = self.properties.remove(BIT_RATES) {
             bit_rates::learn_list(&mut self.bit_rates, &rates);
@@ -127,7 +153,7 @@ impl Decoder {
         if let Some(fault) = fault {
             self.first.push_back(Found::Issue(Place::Offset(0), own(fault)?));
         }
-        let mut open = Opened { file, items: 0, parts, next: BinaryHeap::new() };
+        let mut open = Opened { file, is_gone_through, joined, items: 0, parts, next: BinaryHeap::new() };
         let resume = self.resume.take();
         if let Some(saved) = &resume {
             // It was reported where the file begins.
@@ -220,91 +246,91 @@ impl Opened {
     }
 }
 
-/// The streams of records in a file; if there is a fault, those before it.
-fn parts(
-    file: &mut Whole,
-    zone: &Zone,
-    first: &mut VecDeque<Found>,
-    about: &mut Properties,
-) -> Result<Vec<Part>, (Vec<Part>, Fault)> {
-    let mut parts = Vec::new();
-    match collect(file, zone, first, about, &mut parts) {
-        Ok(()) => Ok(parts),
-        Err(fault) => Err((parts, fault)),
-    }
+/// What is found in a file before its records.
+struct Collecting<'a> {
+    map: &'a mut Map,
+    /// To be reported before the records.
+    first: &'a mut VecDeque<Found>,
+    properties: &'a mut Properties,
+    is_resumed: bool,
+    /// See [`Opened`].
+    is_gone_through: bool,
+    joined: Option<u64>,
 }
 
-fn collect(
-    file: &mut Whole,
-    zone: &Zone,
-    first: &mut VecDeque<Found>,
-    about: &mut Properties,
-    parts: &mut Vec<Part>,
-) -> Result<(), Fault> {
-    const LOCAL_TIME: u8 = 1;
-    const UNFINISHED_AT: usize = 60;
-    let identification = file.read_at(0, HEADER_AT as usize)?;
-    let is_unfinished = identification.starts_with(UNFINISHED_MAGIC);
-    if !is_unfinished && !identification.starts_with(FILE_MAGIC) {
-        return Err(Fault::malformed(
-            "a file that begins with 'MDF'",
-            identification.get(..8).unwrap_or(&identification),
-        ));
-    }
-    let Some(version) = identification.get(8..12) else {
-        return Err(Fault::Truncated("the file header"));
-    };
-    if !version.starts_with(b"4.") {
-        let version = String::from_utf8_lossy(version).trim().to_owned();
-        return Err(Fault::Malformed {
-            expected: "MDF 4.0 or later, into which programs for MDF convert older files".into(),
-            found: format!("MDF {version}"),
-        });
-    }
-    let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };
-    let header = file.block(HEADER_AT, *b"##HD")?;
-    match properties(file, &header) {
-        Ok(found) => *about = found,
-        Err(Fault::Io(error)) => return Err(error.into()),
-        // The traffic can be read all the same.
-        Err(_) => first.push_back(Found::Note(NO_COMMENT)),
-    }
-    let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
-    let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
-    let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
-    let alone = alone(file, header.link(0));
-    let (mut next, mut count) = (header.link(0), 0);
-    if next == 0 {
-        return Err(Fault::malformed("a group of data", b"none"));
-    }
-    while next != 0 {
-        let group = file.block(next, *b"##DG")?;
-        next = group.link(0);
-        count += 1;
-        if count * BLOCK_HEAD_BYTES > file.len() {
-            return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
+impl Collecting<'_> {
+    /// Adds the streams of records in a file; if there is a fault, those before it.
+    fn collect(&mut self, file: &mut Whole, zone: &Zone, parts: &mut Vec<Part>) -> Result<(), Fault> {
+        const LOCAL_TIME: u8 = 1;
+        const UNFINISHED_AT: usize = 60;
+        let identification = file.read_at(0, HEADER_AT as usize)?;
+        let is_unfinished = identification.starts_with(UNFINISHED_MAGIC);
+        if !is_unfinished && !identification.starts_with(FILE_MAGIC) {
+            return Err(Fault::malformed(
+                "a file that begins with 'MDF'",
+                identification.get(..8).unwrap_or(&identification),
+            ));
         }
-        match Part::open(file, &group, open, start_ns, &alone) {
-            Ok((part, signals, faults)) => {
-                first.extend(faults.into_iter().map(|fault| Found::Issue(Place::Offset(next), fault)));
-                first.extend((0..signals).map(|_| Found::LeftOut(MEASURED)));
-                parts.extend(part);
-            }
+        let Some(version) = identification.get(8..12) else {
+            return Err(Fault::Truncated("the file header"));
+        };
+        if !version.starts_with(b"4.") {
+            let version = String::from_utf8_lossy(version).trim().to_owned();
+            return Err(Fault::Malformed {
+                expected: "MDF 4.0 or later, into which programs for MDF convert older files".into(),
+                found: format!("MDF {version}"),
+            });
+        }
+        let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };
+        let header = file.block(HEADER_AT, *b"##HD")?;
+        match properties(file, &header) {
+            Ok(found) => *self.properties = found,
             Err(Fault::Io(error)) => return Err(error.into()),
-            Err(fault) => first.push_back(Found::Issue(Place::Offset(next), fault)),
+            // The traffic can be read all the same.
+            Err(_) => self.first.push_back(Found::Note(NO_COMMENT)),
         }
+        let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
+        let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
+        let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
+        self.map.open_end = open & OPEN_LENGTH != 0;
+        self.map.alone = alone(file, header.link(0));
+        let (mut next, mut count) = (header.link(0), 0);
+        if next == 0 {
+            return Err(Fault::malformed("a group of data", b"none"));
+        }
+        while next != 0 {
+            let group = file.block(next, *b"##DG")?;
+            next = group.link(0);
+            count += 1;
+            if count * BLOCK_HEAD_BYTES > file.len() {
+                return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
+            }
+            match Part::open(file, &group, open, start_ns, self.map) {
+                Ok((part, signals, faults)) => {
+                    self.first
+                        .extend(faults.into_iter().map(|fault| Found::Issue(Place::Offset(next), fault)));
+                    self.first.extend((0..signals).map(|_| Found::LeftOut(MEASURED)));
+                    parts.extend(part);
+                }
+                Err(Fault::Io(error)) => return Err(error.into()),
+                Err(fault) => self.first.push_back(Found::Issue(Place::Offset(next), fault)),
+            }
+        }
+        self.joined = match &self.map.places {
+            Some(places) => places.joined,
+            // It was reported where the file begins.
+            None if self.is_resumed || self.map.open_end => return Ok(()),
+            None => after_blocks(file)?,
+        };
+        self.is_gone_through = true;
+        self.first.extend(self.joined.map(|at| Found::Issue(Place::Offset(at), joined(at))));
+        Ok(())
     }
-    if open & OPEN_LENGTH == 0
-        && let Some(at) = after_blocks(file)?
-    {
-        first.push_back(Found::Issue(Place::Offset(at), joined(at)));
-    }
-    Ok(())
 }
 
 /// Groups of records that are alone in their group of data.
-fn alone(file: &mut Whole, first: u64) -> Alone {
-    let (mut alone, mut next, mut count) = (Alone::new(), first, 0);
+fn alone(file: &mut Whole, first: u64) -> HashMap<u64, u64> {
+    let (mut alone, mut next, mut count) = (HashMap::new(), first, 0);
     while next != 0 && count * BLOCK_HEAD_BYTES <= file.len() {
         // What is wrong with it is said when it is read.
         let Ok(group) = file.block(next, *b"##DG") else { break };

@@ -1,13 +1,12 @@
 //! What an MF4 file says about its groups: which of them carry bus events, and how each part of one is read.
 
-use std::collections::HashMap;
-
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{Block, u16_at, u32_at, u64_at};
 use super::channel::{Channel, Number, VARIABLE, Validity};
 use super::clock::{Clock, is_master};
 use super::field::Field;
+use super::map::Map;
 use super::stream::Stream;
 use super::value::Meaning;
 
@@ -51,9 +50,6 @@ pub(super) enum Elsewhere {
     /// In the records of another group, at this address.
     Group(u64),
 }
-
-/// Which group a group of data consists of, by its address, where it is the only one: its data, from which its records can be read by number.
-pub(super) type Alone = HashMap<u64, u64>;
 
 /// The records of another group, of which each has the time of one here.
 pub(super) struct Times {
@@ -148,14 +144,14 @@ const FRAMES: [(&str, Result<Events, &str>); 10] = [
 ];
 
 /// The clock that is another group's, and that group's records.
-fn elsewhere(file: &mut Whole, address: u64, open_end: bool, alone: &Alone) -> Result<(Clock, Times), Fault> {
+fn elsewhere(file: &mut Whole, address: u64, map: &Map) -> Result<(Clock, Times), Fault> {
     let what = || Fault::Unsupported("a group of frames whose times cannot be found".to_owned().into());
-    let data = alone.get(&address).ok_or_else(what)?;
+    let data = map.alone.get(&address).ok_or_else(what)?;
     let group = file.block(address, *b"##CG")?;
     let all = Channel::all(file, group.link(1))?;
     let clock = Clock::of(file, &all)?.ok_or_else(what)?;
     let bytes = RecordBytes::of(&group);
-    let mut stream = Stream::of_records(file, *data, open_end, bytes.values, bytes.invalid)?;
+    let mut stream = map.stream(file, *data, bytes.values, bytes.invalid)?;
     let record_bytes = if stream.invalid().is_some() { bytes.values } else { bytes.all() };
     Ok((clock, Times { stream, record_bytes }))
 }
@@ -171,8 +167,7 @@ impl Group {
     pub(super) fn open(
         file: &mut Whole,
         address: u64,
-        open_end: bool,
-        alone: &Alone,
+        map: &Map,
     ) -> Result<(Self, u64, Option<Fault>), Fault> {
         let block = file.block(address, *b"##CG")?;
         let (record_id, records) = (u64_at(&block.data, 0), u64_at(&block.data, 8));
@@ -181,7 +176,7 @@ impl Group {
         let content = if u16_at(&block.data, 16) & VARIABLE_LENGTH != 0 {
             Content::Values
         } else {
-            match Content::of(file, &block, open_end, alone) {
+            match Content::of(file, &block, map) {
                 Ok(content) => content,
                 Err(Fault::Io(error)) => return Err(error.into()),
                 // The other groups of its data can still be read.
@@ -196,12 +191,12 @@ impl Group {
 }
 
 impl Content {
-    fn of(file: &mut Whole, group: &Block, open_end: bool, alone: &Alone) -> Result<Self, Fault> {
+    fn of(file: &mut Whole, group: &Block, map: &Map) -> Result<Self, Fault> {
         let all = Channel::all(file, group.link(1))?;
         let begins = |prefix: &str| all.iter().any(|channel| channel.name.starts_with(prefix));
         Ok(match FRAMES.iter().find(|(prefix, _)| begins(prefix)) {
             Some((prefix, Ok(events))) => {
-                Self::Bus(Box::new(BusGroup::open(file, group, &all, (prefix, *events), open_end, alone)?))
+                Self::Bus(Box::new(BusGroup::open(file, group, &all, (prefix, *events), map)?))
             }
             Some((_, Err(what))) => Self::Other(what),
             None if all.len() == 1 && is_master(&all[0]) => Self::Times,
@@ -216,13 +211,12 @@ impl BusGroup {
         group: &Block,
         all: &[Channel],
         (prefix, events): (&str, Events),
-        open_end: bool,
-        alone: &Alone,
+        map: &Map,
     ) -> Result<Self, Fault> {
         let (clock, times) = match Clock::of(file, all)? {
             Some(clock) => (clock, None),
             None if u16_at(&group.data, 16) & REMOTE_MASTER != 0 => {
-                let (clock, times) = elsewhere(file, group.link(6), open_end, alone)?;
+                let (clock, times) = elsewhere(file, group.link(6), map)?;
                 (clock, Some(times))
             }
             None => return Err(Fault::Unsupported("a group of frames without times".to_owned().into())),
@@ -259,7 +253,7 @@ impl BusGroup {
             Some(channel) => Some(Bytes::Here(channel.field(), channel.size(file)?)),
             None => None,
         };
-        let apart = apart.into_iter().map(|channel| Apart::open(file, channel, open_end));
+        let apart = apart.into_iter().map(|channel| Apart::open(file, channel, map));
         let apart = apart.collect::<Result<_, _>>()?;
         let mut bus = 1;
         if group.link(3) != 0 {
@@ -301,14 +295,11 @@ impl BusGroup {
 }
 
 impl Apart {
-    fn open(file: &mut Whole, channel: &Channel, open_end: bool) -> Result<Self, Fault> {
+    fn open(file: &mut Whole, channel: &Channel, map: &Map) -> Result<Self, Fault> {
         let link = channel.block.link(5);
         let is_group = link != 0 && &file.head(link)?.name == b"##CG";
-        let values = if is_group {
-            Elsewhere::Group(link)
-        } else {
-            Elsewhere::Stream(Stream::open(file, link, open_end)?)
-        };
+        let values =
+            if is_group { Elsewhere::Group(link) } else { Elsewhere::Stream(map.stream(file, link, 0, 0)?) };
         Ok(Self { place: channel.field(), values })
     }
 }

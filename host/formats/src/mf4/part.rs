@@ -11,7 +11,8 @@ use super::apart::{MAX_APART, Values, has_arrived};
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at};
 use super::channel::Row;
 use super::joined::joined;
-use super::layout::{Alone, Content, Group, RecordBytes, Times};
+use super::layout::{Apart, Content, Group, RecordBytes, Times};
+use super::map::Map;
 use super::order::{Item, Order};
 use super::place::{Cursor, Mark};
 use super::plain::Plain;
@@ -97,13 +98,12 @@ impl Part {
         block: &Block,
         open: u16,
         start_ns: i64,
-        alone: &Alone,
+        map: &Map,
     ) -> Result<(Option<Self>, u32, Vec<Fault>), Fault> {
         let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
-        let open_end = open & OPEN_LENGTH != 0;
         let (mut groups, mut faults, mut next) = (Vec::new(), Vec::new(), block.link(1));
         while next != 0 {
-            let (group, behind, fault) = Group::open(file, next, open_end, alone)?;
+            let (group, behind, fault) = Group::open(file, next, map)?;
             groups.push(group);
             faults.extend(fault);
             next = behind;
@@ -124,7 +124,7 @@ impl Part {
         let values = values.map(|group| (group.address, Values::default())).collect();
         let is_sorted = groups.len() == 1 && id_bytes == 0;
         let row = if is_sorted { groups[0].record_bytes } else { RecordBytes::default() };
-        let mut stream = Stream::of_records(file, block.link(2), open_end, row.values, row.invalid)?;
+        let mut stream = map.stream(file, block.link(2), row.values, row.invalid)?;
         let record_bytes = groups.iter().map(|group| group.record_bytes.all()).collect::<Vec<_>>();
         let record_bytes = if stream.invalid().is_some() { vec![row.values] } else { record_bytes };
         let plain = groups.iter().zip(&record_bytes).map(|(group, len)| match &group.content {
@@ -165,6 +165,19 @@ impl Part {
             marks: VecDeque::new(),
         };
         Ok((Some(part), signals, faults))
+    }
+
+    /// Its own stream, and those to which its records refer.
+    pub(super) fn streams(&self) -> impl Iterator<Item = &Stream> {
+        let buses = self.groups.iter().filter_map(|group| match &group.content {
+            Content::Bus(bus) => Some(bus),
+            Content::Other(_) | Content::Values | Content::Signals | Content::Times => None,
+        });
+        let others = buses.flat_map(|bus| {
+            let times = bus.times.iter().map(|times| &times.stream);
+            times.chain(bus.apart.iter().filter_map(Apart::stream))
+        });
+        std::iter::once(&self.stream).chain(others)
     }
 
     /// What comes next, in the order of time.

@@ -1,5 +1,7 @@
 //! The data of a group or channel: bytes in one block or many, plain or compressed.
 
+use serde::{Deserialize, Serialize};
+
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at, u64_at};
@@ -24,6 +26,24 @@ const MAX_DEPTH: u32 = 4;
 
 /// Length of the fields of a compressed block before its data.
 const DZ_FIELDS_BYTES: u64 = 24;
+
+/// What a stream is made of.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub(super) struct Origin {
+    /// To its data; 0 if it has none.
+    pub link: u64,
+    /// Bytes of a record's values, and of the bits that say which of them are none.
+    pub row_bytes: (u64, u64),
+}
+
+/// Where the pieces of a stream are in its file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Laid {
+    /// Of each its length in the stream, its position in the file, and how it is compressed.
+    pieces: Vec<(u64, u64, Option<Packed>)>,
+    cut: bool,
+    invalid: Option<Box<Laid>>,
+}
 
 /// A contiguous piece of the stream in the file.
 #[derive(Clone, Copy, Debug)]
@@ -50,9 +70,8 @@ pub(super) struct Stream {
     ahead: u64,
     /// Where in the file another one begins.
     next_file: Option<u64>,
-    /// Bytes of a record's values, and of the bits that say which of them are none.
-    row_bytes: (u64, u64),
-    /// These bits, where they lie apart (4.2).
+    origin: Origin,
+    /// The bits that say which values are none, where they lie apart (4.2).
     invalid: Option<Box<Stream>>,
     /// What was read last, and its position in the stream.
     buffer: Vec<u8>,
@@ -61,28 +80,31 @@ pub(super) struct Stream {
 }
 
 impl Stream {
-    /// The data at a link. `open_end`: the last block's length was not written, and it extends to the end of the file.
-    pub(super) fn open(file: &mut Whole, link: u64, open_end: bool) -> Result<Self, Fault> {
-        let mut stream = Self::default();
-        if link != 0 {
-            stream.collect(file, link, open_end, 0)?;
+    /// Goes through its blocks. `open_end`: the last block's length was not written, and it extends to the end of the file.
+    pub(super) fn open(file: &mut Whole, origin: Origin, open_end: bool) -> Result<Self, Fault> {
+        let mut stream = Self { origin, ..Self::default() };
+        if origin.link != 0 {
+            stream.collect(file, origin.link, open_end, 0)?;
         }
         Ok(stream)
     }
 
-    /// As [`Self::open`], the data of a group of records: bits that say which values are none may lie apart.
-    pub(super) fn of_records(
-        file: &mut Whole,
-        link: u64,
-        open_end: bool,
-        value_bytes: usize,
-        invalid_bytes: usize,
-    ) -> Result<Self, Fault> {
-        let mut stream = Self { row_bytes: (value_bytes as u64, invalid_bytes as u64), ..Self::default() };
-        if link != 0 {
-            stream.collect(file, link, open_end, 0)?;
+    /// The same without going through its blocks: what [`Self::laid`] returned.
+    pub(super) fn of(origin: Origin, laid: &Laid) -> Self {
+        let mut stream = Self { origin, cut: laid.cut, ..Self::default() };
+        stream.pieces.reserve(laid.pieces.len());
+        for (len, at, packed) in &laid.pieces {
+            stream.push(*len, *at, *packed);
         }
-        Ok(stream)
+        stream.invalid = laid.invalid.as_ref().map(|laid| Box::new(Self::of(Origin::default(), laid)));
+        stream
+    }
+
+    /// Where its pieces are.
+    pub(super) fn laid(&self) -> (Origin, Laid) {
+        let pieces = self.pieces.iter().map(|piece| (piece.len, piece.at, piece.packed)).collect();
+        let invalid = self.invalid.as_ref().map(|stream| Box::new(stream.laid().1));
+        (self.origin, Laid { pieces, cut: self.cut, invalid })
     }
 
     /// The bits that say which values are none, where they lie apart.
@@ -199,11 +221,11 @@ impl Stream {
             if *link != 0 {
                 self.collect(file, *link, open_end, depth)?;
             }
-            let rows = (self.len - before).checked_div(self.row_bytes.0).unwrap_or(0);
+            let rows = (self.len - before).checked_div(self.origin.row_bytes.0).unwrap_or(0);
             let bits = self.invalid.get_or_insert_default();
             match invalid.get(at) {
                 Some(&link) if link != 0 => bits.collect(file, link, open_end, depth)?,
-                _ => bits.push(rows * self.row_bytes.1, ALL_VALID, None),
+                _ => bits.push(rows * self.origin.row_bytes.1, ALL_VALID, None),
             }
         }
         Ok(())

@@ -4,13 +4,14 @@ use std::io::Read;
 use std::sync::Mutex;
 
 use flate2::{Decompress, FlushDecompress, Status};
+use serde::{Deserialize, Serialize};
 
 use super::super::cores;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 
 /// How a block is compressed.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub(super) struct Packed {
     /// Bytes in the file.
     pub stored: u64,

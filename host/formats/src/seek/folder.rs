@@ -21,12 +21,25 @@ const SUFFIX: &str = "index";
 /// A folder for the indexes of large traces, of which a part is then read without the rest. It holds at most 256 MB; whatever is in it can be deleted at
 /// any time.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct IndexFolder(PathBuf);
+pub struct IndexFolder {
+    path: PathBuf,
+    is_only_used: bool,
+}
 
 impl IndexFolder {
     /// This folder, which is made when it is needed, readable by the user alone.
     pub fn new(path: impl Into<PathBuf>) -> Self {
-        Self(path.into())
+        Self { path: path.into(), is_only_used: false }
+    }
+
+    /// The same for readings that are to make no index, and use one that is there.
+    #[must_use]
+    pub fn only_used(self) -> Self {
+        Self { is_only_used: true, ..self }
+    }
+
+    pub(super) const fn is_only_used(&self) -> bool {
+        self.is_only_used
     }
 
     /// Whether a trace of this many bytes has an index.
@@ -42,7 +55,7 @@ impl IndexFolder {
         hash.update([0]);
         hash.update(how);
         let name = hash.finalize()[..16].iter().fold(0, |name: u128, byte| name << 8 | u128::from(*byte));
-        Some(self.0.join(format!("{name:032x}.{SUFFIX}")))
+        Some(self.path.join(format!("{name:032x}.{SUFFIX}")))
     }
 
     /// The index in a file, if there is one that can be used.
@@ -76,7 +89,7 @@ impl IndexFolder {
             folder.mode(0o700);
             file.mode(0o600);
         }
-        folder.recursive(true).create(&self.0)?;
+        folder.recursive(true).create(&self.path)?;
         let unfinished = path.with_extension(format!("{}-{:08x}", std::process::id(), unique()));
         let written = file
             .write(true)
@@ -94,7 +107,7 @@ impl IndexFolder {
     fn make_room(&self, newest: &Path) -> io::Result<()> {
         const HOUR_SECONDS: u64 = 3600;
         let mut files = Vec::new();
-        for entry in fs::read_dir(&self.0)? {
+        for entry in fs::read_dir(&self.path)? {
             let entry = entry?;
             let (path, about) = (entry.path(), entry.metadata()?);
             if about.is_file() && path != newest {

@@ -49,6 +49,8 @@ pub(super) struct Index {
     pub identity: Option<Identity>,
     /// Whether the file is read at many places: then there are no digests.
     pub is_random: bool,
+    /// Where its data is, if it is read at many places: what a decoder needs besides a place's state.
+    pub layout: Vec<u8>,
     /// Of the first record.
     pub first_ns: Option<i64>,
     pub places: Vec<Place>,
@@ -66,6 +68,8 @@ struct Stored<'a> {
     how: &'a str,
     identity: Option<Identity>,
     is_random: bool,
+    #[serde(borrow)]
+    layout: &'a [u8],
     first_ns: Option<i64>,
     places: Vec<Place>,
     parts: Vec<Part>,
@@ -159,6 +163,7 @@ impl Index {
             how,
             identity: self.identity,
             is_random: self.is_random,
+            layout: &self.layout,
             first_ns: self.first_ns,
             places: self.places.clone(),
             parts: self.parts.clone(),
@@ -192,8 +197,9 @@ impl Index {
                 || places.last().is_some_and(|end| end.offset <= blocks.bytes()))
             && stored.parts.iter().all(|part| is_known(&part.notes) && is_known(&part.left_out));
         is_one.then_some(())?;
-        let Stored { identity, is_random, first_ns, places, parts, .. } = stored;
-        Some(Self { identity, is_random, first_ns, places, parts, texts, blocks })
+        let Stored { identity, is_random, layout, first_ns, places, parts, .. } = stored;
+        let layout = layout.to_vec();
+        Some(Self { identity, is_random, layout, first_ns, places, parts, texts, blocks })
     }
 
     /// Whether it is time for another place.

@@ -163,7 +163,10 @@ impl Indexing {
         let stored = stored.filter(|_| stored_is_same || !is_random);
         let first = Place { offset: reading.position(), lines: 0, state };
         let usable = match (range, stored) {
-            (None, _) if stored_is_same => return Ok(false),
+            (None, Some(index)) if stored_is_same => {
+                reading.decoder.restore_layout(&index.layout);
+                return Ok(false);
+            }
             (Some(range), Some(mut index)) => {
                 if !stored_is_same && let Some(file) = reading.input.file() {
                     // It may have grown.
@@ -179,8 +182,12 @@ impl Indexing {
             _ => None,
         };
         self.index = if let Some(index) = usable {
+            reading.decoder.restore_layout(&index.layout);
             index
         } else {
+            if self.folder.is_only_used() {
+                return Ok(false);
+            }
             self.range = None;
             self.is_learning = true;
             self.open = Open::of(reading);
@@ -245,6 +252,10 @@ impl Indexing {
         if !reading.decoder.save(&mut state) {
             return;
         }
+        if self.index.layout.is_empty() {
+            // Without it, each reading goes through the file.
+            reading.decoder.save_layout(&mut self.index.layout);
+        }
         let place = Place { offset, lines: reading.input.line_number(), state };
         let part = self.open.part(reading, &mut self.index);
         self.index.add(part, place);
@@ -260,6 +271,7 @@ impl Indexing {
         if decoder.restore(&place.state).is_none() || !decoder.save(&mut state) || state != place.state {
             return self.distrust(reading).map(|()| false);
         }
+        decoder.restore_layout(&self.index.layout);
         self.has_passed = true;
         if !self.index.is_random {
             reading.input.seek_to(place.offset, place.lines)?;

@@ -238,6 +238,25 @@ fn parts_outside_of_the_range_are_not_read() {
     }
 }
 
+/// A file that is played, at its own speed, makes none.
+#[test]
+fn an_index_that_is_only_used_is_not_made() {
+    for format in FORMATS {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, kept) = (folder.path().join("trace"), folder.path().join("indexes"));
+        let records: Vec<_> = (0..2000).map(|at| data_record(at * 1_000_000)).collect();
+        fs::write(&path, file(*format, &records)).unwrap();
+        let made = options(*format, Some(&kept));
+        let used = ReadOptions { index: Some(IndexFolder::new(&kept).only_used()), ..made.clone() };
+        let all = |options: &ReadOptions| read(&path, options, TimeRange::default(), false);
+        let before = all(&used);
+        assert_eq!((indexes(&kept).len(), before.items.len()), (0, 2000), "{format}");
+        all(&made);
+        assert_eq!(indexes(&kept).len(), 1, "{format}");
+        assert_same_items(&all(&used), &before, *format);
+    }
+}
+
 #[test]
 fn a_file_that_grew_keeps_its_index_and_one_that_was_changed_does_not() {
     let folder = tempfile::tempdir().unwrap();

@@ -47,6 +47,11 @@ struct Binder<'a> {
 impl Binder<'_> {
     /// Binds something whose truth is asked: there, a listener's name alone asks whether it has a value.
     fn truth(&mut self, node: &Node) -> Result<Expression, Fault> {
+        if let Kind::Number(_) = node.kind {
+            let rest = self.text.get(node.at..).unwrap_or_default();
+            let end = rest.find(|c: char| !(c.is_ascii_alphanumeric() || c == '.')).unwrap_or(rest.len());
+            return Err((node.at, ConditionFault::LoneNumber(rest[..end].to_owned())));
+        }
         Ok(match self.bind(node)? {
             Expression::Field(name) => Expression::HasField(name),
             other => other,

@@ -71,6 +71,9 @@ pub enum ConditionFault {
     /// An unknown name, because no database was loaded.
     #[error("{0:?} is not part of a frame, and without a database there are neither signals nor messages")]
     NoDatabase(String),
+    /// A number whose truth is asked: the same for every record.
+    #[error("{}", lone_number(.0))]
+    LoneNumber(String),
     /// A text where it cannot be compared.
     #[error("a text can only be compared with a signal, by == or !=")]
     LoneText,
@@ -97,6 +100,15 @@ fn not_a_number(digits: &str) -> String {
     let is_hex = digits.len() <= 8 && digits.bytes().all(|byte| byte.is_ascii_hexdigit());
     let meant = if is_hex { format!("; in hexadecimal digits it is 0x{digits}") } else { String::new() };
     format!("{digits:?} is not a number{meant}")
+}
+
+/// With what was meant by whoever searches for an identifier.
+fn lone_number(digits: &str) -> String {
+    let digits = digits.trim_start_matches("0x").trim_start_matches("0X");
+    let is_id = u32::from_str_radix(digits, 16).is_ok_and(|raw| raw <= 0x1FFF_FFFF);
+    let meant =
+        if is_id { format!("; frames with that identifier are id == 0x{digits}") } else { String::new() };
+    format!("a number is to be compared with something{meant}")
 }
 
 impl fmt::Display for ConditionError {

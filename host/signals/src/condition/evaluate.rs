@@ -361,6 +361,15 @@ mod tests {
             ),
             ("byte[1 + 0.5] == 1", "a frame has no byte 1.5; "),
             ("byte[64] == 1", "a frame has no byte 64; "),
+            (
+                "7E8",
+                "a number is to be compared with something; frames with that identifier are id == 0x7E8\n  7E8\n  ^",
+            ),
+            (
+                "Speed and 0x3",
+                "a number is to be compared with something; frames with that identifier are id == 0x3\n",
+            ),
+            ("not 1.5", "a number is to be compared with something\n  not 1.5\n      ^"),
             ("'Drive' > 1", "a text can only be compared with a signal, by == or !=\n  'Drive' > 1\n  ^"),
         ] {
             let error = Condition::new(text, &decoder()).unwrap_err().to_string();

@@ -89,6 +89,25 @@ impl FromStr for IdPattern {
     }
 }
 
+/// Where several identifiers may stand, in filters an interface may, too.
+const OR_INTERFACE: &str = ", or an interface as can0";
+
+impl IdError {
+    /// The same where only one identifier may stand.
+    fn of_one(self) -> String {
+        match self {
+            Self::Unknown(text) => format!(
+                "'{text}' is not an identifier; write up to 3 hexadecimal digits (123), or up to 8 for 29 bits (09F80102)"
+            ),
+            Self::TooLarge { text, bits, instead } => {
+                let instead = instead.strip_suffix(OR_INTERFACE).map(str::to_owned).unwrap_or(instead);
+                Self::TooLarge { text, bits, instead }.to_string()
+            }
+            other => other.to_string(),
+        }
+    }
+}
+
 /// Without `0x`.
 fn plain(text: &str) -> &str {
     text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")).unwrap_or(text)
@@ -134,7 +153,7 @@ fn digits(text: &str) -> Result<IdFilter, IdError> {
             text: text.to_owned(),
             bits: if flag == 0 { 11 } else { 29 },
             instead: if flag == 0 {
-                format!("{value:08X} for the one of 29 bits, or an interface as can0")
+                format!("{value:08X} for the one of 29 bits{OR_INTERFACE}")
             } else {
                 "an identifier up to 1FFFFFFF".to_owned()
             },
@@ -197,13 +216,13 @@ pub const fn group_of(id: Id) -> Option<u32> {
 
 /// One identifier: `123`, `0x123`, `09F80102`.
 pub fn identifier(text: &str) -> Result<Id, String> {
-    let IdFilter { id, .. } = digits(text).map_err(|error| error.to_string())?;
+    let IdFilter { id, .. } = digits(text).map_err(IdError::of_one)?;
     if text.contains('?') {
         return Err(format!("'{text}' is several identifiers; give one"));
     }
     let raw = id & !EXTENDED;
     let id = if id & EXTENDED == 0 { Id::standard(raw) } else { Id::extended(raw) };
-    id.ok_or_else(|| IdError::Unknown(text.to_owned()).to_string())
+    id.ok_or_else(|| IdError::Unknown(text.to_owned()).of_one())
 }
 
 /// A frame to be sent, as can-utils' cansend has it, with its identifier in this grammar: `123#DEADBEEF`, `1#00`, `0x18FEF100#11.22`, `123#R3`.
@@ -326,6 +345,20 @@ mod tests {
         }
         for text in ["12?#00", "800#", "x#", "123", "123#1"] {
             assert!(frame(text).is_err(), "{text}");
+        }
+        // What is advised can be written there.
+        for (text, says) in [
+            (
+                "7EG#11",
+                "'7EG' is not an identifier; write up to 3 hexadecimal digits (123), or up to 8 for 29 bits (09F80102)",
+            ),
+            (
+                "pgn:129025#11",
+                "'pgn:129025' is not an identifier; write up to 3 hexadecimal digits (123), or up to 8 for 29 bits (09F80102)",
+            ),
+            ("800#11", "'800' has more than 11 bits; write 00000800 for the one of 29 bits"),
+        ] {
+            assert_eq!(frame(text), Err(says.to_owned()), "{text}");
         }
     }
 

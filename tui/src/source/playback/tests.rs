@@ -80,6 +80,7 @@ fn a_jump_passes_over_what_lies_between_and_says_from_when_on_everything_is_coun
         recording: None,
         timed: Timed::default(),
         scripts: SessionScripts::default(),
+        asking: None,
         indexes: Some(IndexFolder::new(folder.path().join("indexes"))),
     };
     std::thread::scope(|scope| {

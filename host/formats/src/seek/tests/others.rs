@@ -71,6 +71,8 @@ fn check(
         |(at, more): &(Any, i64)| Some(TimePoint::At(times[at.index(times.len())].saturating_add(*more)));
     let ranges: Vec<_> = ranges.iter().map(|[start, end]| TimeRange::new(point(start), point(end))).collect();
     assert_same(&path, format, &indexes, &ranges);
+    // All of it, with what the index knows of where its data is.
+    assert_same(&path, format, &indexes, &[TimeRange::default()]);
     if let Some((at, value)) = change {
         let at = at.index(bytes.len());
         bytes[at] = value;

@@ -197,7 +197,7 @@ fn number_text(value: &Value) -> String {
 }
 
 fn rounded(value: f64) -> String {
-    cantap_work::rounded(value, DECIMALS).to_string()
+    crate::rounded(value, DECIMALS).to_string()
 }
 
 /// A value with its unit and its meaning, without quotes.

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use cantap::{TraceEvent, TraceRecord};
 use cantap_signals::condition::Condition;
 use cantap_trace::filter::{Filter, passes};
+use cantap_trace::{Interval, Moment};
 
 use super::kept::Kept;
 
@@ -208,6 +209,16 @@ impl History {
         }
         let last = self.end().checked_sub(1).filter(|last| *last >= self.first());
         last.map(|last| low.min(last))
+    }
+
+    /// How long it was from one time to another, listed records or not.
+    pub fn interval(&self, from_ns: i64, to_ns: i64) -> Interval {
+        let moment_at = |time_ns| {
+            let place = self.records.partition_point(|kept| kept.moment().time_ns < time_ns);
+            let earlier = self.records.range(..place).rev().map(Kept::moment);
+            Moment::at(time_ns, earlier, self.records.range(place..).map(Kept::moment))
+        };
+        moment_at(to_ns).interval_since(moment_at(from_ns))
     }
 
     /// All records kept, listed or not, the oldest first.

@@ -272,7 +272,6 @@ fn listed(left_out: &LeftOut, forgotten: u64) -> Vec<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_trace::counted;
     use cantap_trace::{Direction, TraceEvent};
 
     fn frame(second: i64, frame: &str) -> TraceRecord {

@@ -300,7 +300,7 @@ mod tests {
 
     #[test]
     fn fd_frames_make_room_by_their_size() {
-        let mut history = History::new(32 * 4000);
+        let mut history = History::new(size_of::<Kept>() * 4000);
         let event = |at: i64| {
             let frame = format!("123##1{}", "00".repeat(64)).parse().unwrap();
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };

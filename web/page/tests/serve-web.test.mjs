@@ -75,6 +75,7 @@ test('a server has a page at each address, each with its own token', async () =>
     assert.notEqual(first.port, second.port);
     assert.notEqual(first.search, second.search);
     const page = await newPage({ url: second.href });
+    await page.locator('.shell').waitFor();
     await untilReceived(page, 100);
     await page.done();
     const stranger = await fetch(`${second.origin}/${first.search}`);

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use cantap_columns::MessageColumns;
 use cantap_signals::{Decoder, Selection, Source};
+use cantap_trace::counted;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -156,7 +157,7 @@ impl Database {
     fn __repr__(&self) -> String {
         let files: Vec<_> = self.files.iter().map(|(_, path)| path.display().to_string()).collect();
         let files = if files.is_empty() { "the virtual car".to_owned() } else { files.join(", ") };
-        format!("<cantap.Database of {files}: {} messages>", self.decoder.messages().count())
+        format!("<cantap.Database of {files}: {}>", counted(self.decoder.messages().count(), "message"))
     }
 
     #[expect(clippy::type_complexity, reason = "what pickle wants")]

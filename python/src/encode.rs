@@ -14,6 +14,7 @@ use arrow_schema::DataType;
 use cantap_columns::FrameColumns;
 use cantap_signals::encode::{EncodeError, Input, encode_message};
 use cantap_signals::{Decoder, Indicator, Message, MessageRef, Number, SignalValue};
+use cantap_trace::counted;
 use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::{Frame as ClassicFrame, TraceFrame, TraceRecord};
 use pyo3::exceptions::PyTypeError;
@@ -110,8 +111,8 @@ impl Database {
         let data = encode_message(of, &inputs).map_err(Error::from)?;
         let frame = ClassicFrame::data_frame(of.id, &data).ok_or_else(|| {
             Error::Database(format!(
-                "message {message} has {} bytes, and a frame of classical CAN has 8; cantap.encode makes CAN FD frames for a trace",
-                of.length
+                "message {message} has {}, and a frame of classical CAN has 8; cantap.encode makes CAN FD frames for a trace",
+                counted(of.length, "byte")
             ))
         })?;
         Ok(Frame(frame.into()))

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use cantap_formats::{Fault, LeftOut, ReadIssue, TraceReader};
+use cantap_trace::counted;
 use cantap_trace::{TraceEvent, TraceRecord};
 use pyo3::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -130,7 +131,7 @@ impl Counts {
         let others = match more {
             0 => String::new(),
             1 => ", and 1 more place".to_owned(),
-            more => format!(", and {more} more places"),
+            more => format!(", and {more}", more = counted(more, "more place")),
         };
         Some(format!("{first}{others}; {share:.2} % of the file could not be read (see the table's report)"))
     }
@@ -141,8 +142,9 @@ impl Counts {
     pub fn nothing_decoded(&self) -> Option<String> {
         (self.frames > 0 && self.decoded == 0).then(|| {
             format!(
-                "{}: none of its {} frames could be decoded with the database; is it the right one?",
-                self.file, self.frames
+                "{}: none of its {} could be decoded with the database; is it the right one?",
+                self.file,
+                counted(self.frames, "frame")
             )
         })
     }
@@ -327,7 +329,9 @@ impl Report {
         let Counts { file, format, records, frames, lost, issues, .. } = self.now();
         let state = if self.is_whole() { "whole" } else { "not whole" };
         format!(
-            "<cantap.Report of {file} ({format}): {records} records, {frames} frames, {lost} lost, {issues} issues, {state}>"
+            "<cantap.Report of {file} ({format}): {records}, {frames}, {lost} lost, {issues} issues, {state}>",
+            records = counted(records, "record"),
+            frames = counted(frames, "frame")
         )
     }
 

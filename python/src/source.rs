@@ -6,6 +6,7 @@ use std::sync::Arc;
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{Fault, Format, IndexFolder, ReadOptions, TraceReader, Zone};
 use cantap_signals::Decoder;
+use cantap_trace::counted;
 use cantap_trace::filter::{Filter, passes};
 use cantap_trace::{PlainFrame, TraceRecord};
 use pyo3::prelude::*;
@@ -231,7 +232,7 @@ impl TraceSource {
         let Some(before) = &self.before else { return self.counts.clone() };
         let mut all = before.clone();
         all.add(&self.counts);
-        all.file = format!("{} files from {} to {}", self.file + 1, before.file, self.counts.file);
+        all.file = format!("{} from {} to {}", counted(self.file + 1, "file"), before.file, self.counts.file);
         all
     }
 

@@ -11,6 +11,7 @@ use arrow_array::{Array, RecordBatch, RecordBatchIterator, RecordBatchReader, St
 use arrow_ipc::reader::StreamReader;
 use arrow_ipc::writer::StreamWriter;
 use arrow_schema::{ArrowError, SchemaRef};
+use cantap_trace::counted;
 use pyo3::exceptions::{PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyCapsule, PyDict, PyList, PySlice, PyTuple};
@@ -207,7 +208,7 @@ impl Table {
 
     fn __repr__(&self) -> String {
         let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).collect();
-        format!("<cantap.Table of {} rows: {}>", self.rows(), names.join(", "))
+        format!("<cantap.Table of {}: {}>", counted(self.rows(), "row"), names.join(", "))
     }
 
     fn __arrow_c_schema__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyCapsule>> {

@@ -9,6 +9,7 @@ use anyhow::{Context, bail};
 use cantap_analysis::align::{Agreement, AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
 use cantap_formats::{Format, LeftOut, ReadOptions, open_reader};
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 use serde_json::{Value, json};
 
 use super::convert::{WriteArgs, refuse_same_file};
@@ -189,7 +190,8 @@ fn given(args: &Args) -> anyhow::Result<(Vec<Clock>, Vec<u8>)> {
     if args.shift.len() != 1 && args.shift.len() != others {
         let count = args.shift.len();
         return Err(usage(format!(
-            "--shift is given {count} times for {others} traces: once for all, or once for each"
+            "--shift is given {count} for {others} traces: once for all, or once for each",
+            count = counted(count, "time")
         )));
     }
     let sketches = args.traces.iter().map(|path| sketch(args, path, RUN_LENGTHS[0]));
@@ -318,7 +320,7 @@ fn print(out: &mut impl Write, first: &Path, path: &Path, found: &Found) -> io::
     let steps = match alignment.map.steps() {
         0 => String::new(),
         1 => ", and was set once meanwhile".to_owned(),
-        steps => format!(", and was set {steps} times meanwhile"),
+        steps => format!(", and was set {steps} meanwhile", steps = counted(steps, "time")),
     };
     writeln!(
         out,
@@ -329,8 +331,10 @@ fn print(out: &mut impl Write, first: &Path, path: &Path, found: &Found) -> io::
     )?;
     writeln!(
         out,
-        "{} frames in both; of the common time, {} only in {first}, {} only in {path}",
-        agreement.both, agreement.only_first, agreement.only_second
+        "{} in both; of the common time, {} only in {first}, {} only in {path}",
+        counted(agreement.both, "frame"),
+        agreement.only_first,
+        agreement.only_second
     )?;
     writeln!(
         out,

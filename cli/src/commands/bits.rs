@@ -5,6 +5,7 @@ use std::process::ExitCode;
 
 use cantap::{FdBits, FdFrame, Frame, FrameBits, TraceFrame};
 
+use cantap_trace::counted;
 use cantap_trace::grammar;
 
 use crate::args;
@@ -65,7 +66,7 @@ fn classic(args: &Args, frame: &Frame) -> std::io::Result<()> {
         )?;
     } else {
         writeln!(out, "frame       {}", args.frame)?;
-        writeln!(out, "length      {} bits, intermission included", bits.total())?;
+        writeln!(out, "length      {}, intermission included", counted(bits.total(), "bit"))?;
         writeln!(out, "frame bits  {}", bits.unstuffed)?;
         writeln!(out, "stuff bits  {}", bits.stuff)?;
         writeln!(out, "CRC         0x{:03X}", bits.crc)?;
@@ -97,7 +98,7 @@ fn flexible(args: &Args, frame: &FdFrame) -> std::io::Result<()> {
         );
     }
     writeln!(out, "frame       {frame}")?;
-    writeln!(out, "length      {} bits, intermission included", bits.total())?;
+    writeln!(out, "length      {}, intermission included", counted(bits.total(), "bit"))?;
     if frame.brs() {
         writeln!(
             out,

@@ -12,13 +12,13 @@ use cantap::{Frame, Id};
 use cantap_protocols::active::Broadcast;
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use cantap_protocols::{Event, EventKind};
+use cantap_trace::counted;
 use cantap_trace::grammar;
 
 use crate::args;
 use crate::protocols::SheetPath;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
-use cantap_work::terms::counted;
 
 /// The command line.
 #[derive(clap::Args)]

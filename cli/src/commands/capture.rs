@@ -12,6 +12,7 @@ use cantap_address::Address;
 use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
 use cantap_signals::named::NamedFilter;
 use cantap_signals::trigger::Trigger;
+use cantap_trace::counted;
 use cantap_trace::filter::{Filter, passes};
 
 use self::sink::Sink;
@@ -305,7 +306,7 @@ impl View {
                 });
                 let rate = rate.map_or(String::new(), |rate| format!(" {rate:.0}/s"));
                 let load = meter.bus_load_pct().map_or(String::new(), |load| format!(" {load:.0} %"));
-                format!("{number}: {} frames{rate}{load}", meter.frames())
+                format!("{number}: {}{rate}{load}", counted(meter.frames(), "frame"))
             });
             let channels = channels.collect::<Vec<_>>().join("  ");
             let of = |meter: &Meter| (meter.lost(), meter.lost_at_least());

@@ -10,6 +10,7 @@ use cantap::TraceRecord;
 use cantap::device::channel_number;
 use cantap_address::Address;
 use cantap_analysis::align::compare;
+use cantap_trace::counted;
 use cantap_work::boards::Boards;
 use cantap_work::channels::{Channels, place_of};
 use cantap_work::live::LiveRecords;
@@ -78,8 +79,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let comparison = compare(first, second).with_context(|| {
         let [first, second] = &adapters;
         format!(
-            "the {} frames of '{}' and the {} of '{}' cannot be compared",
-            first.frames, first.device, second.frames, second.device
+            "the {} of '{}' and the {} of '{}' cannot be compared",
+            counted(first.frames, "frame"),
+            first.device,
+            second.frames,
+            second.device
         )
     })?;
     let result = Outcome::new(adapters, &comparison, is_cut);

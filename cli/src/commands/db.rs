@@ -9,12 +9,12 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use cantap_signals::{Database, Decoder, Source};
+use cantap_trace::counted;
 use serde_json::json;
 
 use crate::completion;
 use crate::input::ReadArgs;
 use crate::usage_error::usage;
-use cantap_work::terms::counted;
 use clap::Arg;
 
 /// The command line.

@@ -21,6 +21,7 @@ use std::sync::Arc;
 use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::ReadItem;
 use cantap_signals::{Decoder, NotDecoded, SignalValue};
+use cantap_trace::counted;
 
 use self::decoded::Decoded;
 use self::output::{Form, Output};
@@ -76,11 +77,20 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let left_out = output.left_out();
     output.finish(&summary)?;
     let Count { frames, decoded, values, lost, lost_at_least, not_decoded, events } = count;
-    let said = if args.protocols { format!(", {events} events of protocols") } else { String::new() };
-    eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values{said}");
+    let said = if args.protocols {
+        format!(", {events} of protocols", events = counted(events, "event"))
+    } else {
+        String::new()
+    };
+    eprintln!(
+        "cantap: decoded {decoded} of {frames}, {values}{said}",
+        frames = counted(frames, "frame"),
+        values = counted(values, "value")
+    );
     if left_out > 0 {
         eprintln!(
-            "cantap: {left_out} values of protocols are texts or bytes, which a table of numbers has no columns for; --csv without --wide has them"
+            "cantap: {left_out} of protocols are texts or bytes, which a table of numbers has no columns for; --csv without --wide has them",
+            left_out = counted(left_out, "value")
         );
     }
     for (what, count) in not_decoded.iter() {
@@ -89,7 +99,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     match (lost, lost_at_least) {
         (0, false) => {}
         (0, true) => eprintln!("cantap: an unknown number of frames is missing in the trace"),
-        _ => eprintln!("cantap: {lost} frames or more are missing in the trace"),
+        _ => eprintln!("cantap: {lost} or more are missing in the trace", lost = counted(lost, "frame")),
     }
     records.judge()?;
     Ok(ExitCode::SUCCESS)

@@ -6,6 +6,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use cantap_trace::counted;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use cantap_trace::filter::Filter;
 use serde_json::{Value, json};
@@ -136,7 +137,13 @@ fn name(args: &Args, key: Key) -> String {
 fn print(args: &Args, difference: &Difference, out: &mut impl Write) -> std::io::Result<()> {
     for (path, only) in [(&args.a, &difference.only_a), (&args.b, &difference.only_b)] {
         for (key, count) in only {
-            writeln!(out, "{}: only in {} ({count} frames)", name(args, *key), path.display())?;
+            writeln!(
+                out,
+                "{}: only in {} ({count})",
+                name(args, *key),
+                path.display(),
+                count = counted(count, "frame")
+            )?;
         }
     }
     for Changed { key, period_ns, dlcs, flags, bytes } in &difference.changed {

@@ -7,11 +7,11 @@ use std::time::Duration;
 use cantap::device::Records;
 use cantap::wire::message::{MAX_DISTURBANCE_BITS, Mode};
 use cantap::{Channel, Id, TraceEvent, TraceRecord};
+use cantap_trace::counted;
 use cantap_trace::grammar;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::disturbance::{self, Disturbance, Plan, When};
 use cantap_work::interrupt;
-use cantap_work::terms::counted;
 
 use crate::one_board::OneBoard;
 use crate::timing_args::TimingArgs;

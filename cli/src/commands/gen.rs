@@ -11,6 +11,7 @@ use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
 use cantap::{Channel, FdFrame, Frame, Id, TraceFrame};
+use cantap_trace::counted;
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 
 use crate::args;
@@ -22,7 +23,6 @@ use crate::usage_error::usage;
 use cantap_work::interrupt;
 use cantap_work::rounded;
 use cantap_work::sending::Sending;
-use cantap_work::terms::counted;
 use filled::Filled;
 
 /// Frames that leave this much later than their gap says are told: more than other frames on the bus explain at any common bit rate.

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use cantap::wire::Channel;
 use cantap::wire::message::capability;
 use cantap_adapters::Row;
+use cantap_trace::counted;
 
 use crate::one_board::OneBoard;
 
@@ -86,11 +87,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "channels        {}", hello.channels)?;
         writeln!(out, "CAN clock       {} MHz", f64::from(hello.can_clock_hz) / 1e6)?;
         writeln!(out, "time stamps     {} MHz", f64::from(hello.tick_hz) / 1e6)?;
-        writeln!(out, "record queue    {} bytes", hello.queue_bytes)?;
+        writeln!(out, "record queue    {}", counted(hello.queue_bytes, "byte"))?;
         writeln!(
             out,
-            "transmission    queue of {} frames, {} periodic and {} reply entries per channel",
-            hello.tx_queue, hello.periodic_slots, hello.trigger_slots
+            "transmission    queue of {}, {} periodic and {} reply entries per channel",
+            counted(hello.tx_queue, "frame"),
+            hello.periodic_slots,
+            hello.trigger_slots
         )?;
         writeln!(out, "filter banks    {}", hello.filter_banks)?;
         writeln!(out, "CAN FD          {can_fd}")?;

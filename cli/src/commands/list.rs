@@ -6,6 +6,8 @@ mod network;
 use std::io::Write;
 use std::process::ExitCode;
 
+use cantap_trace::counted;
+
 use self::network::Network;
 use crate::stderr;
 
@@ -102,8 +104,8 @@ fn tell_unusable(makers: &makers::Found) {
     }
     if makers.without_address > 0 {
         stderr::tell(&format!(
-            "cantap: {} channels are left out, of kinds that cannot be addressed here\n",
-            makers.without_address
+            "cantap: left out: {}, of kinds that cannot be addressed here\n",
+            counted(makers.without_address, "channel")
         ));
     }
 }

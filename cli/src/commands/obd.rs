@@ -14,6 +14,7 @@ use crate::keyboard::Keyboard;
 use crate::speak_args::SpeakArgs;
 use crate::usage_error::usage;
 use crate::{args, stderr};
+use cantap_trace::counted;
 use cantap_work::code_texts::CodeTexts;
 use cantap_work::interrupt;
 use cantap_work::obd::{Table, Vehicle, is_answer};
@@ -331,7 +332,10 @@ impl Asker<'_> {
             self.show(is_answer)?;
             // A table shows it in its rows.
             if answers < servers && self.table.is_none() {
-                eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
+                eprintln!(
+                    "cantap: {pid:02X}: {answers} of {servers} answered",
+                    servers = counted(servers, "ECU")
+                );
             }
         }
         Ok(answered)

@@ -19,6 +19,7 @@ use crate::one_board::OneBoard;
 use crate::print_sent::print_sent;
 use crate::stderr;
 use crate::usage_error::usage;
+use cantap_trace::counted;
 use cantap_trace::filter::Filter;
 use cantap_trace::grammar;
 use cantap_work::interrupt;
@@ -202,7 +203,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         writeln!(std::io::stdout(), "{object}")?;
     } else {
-        eprint!("cantap: {} frames in {seconds:.1} s", sending.sent());
+        eprint!("cantap: {} in {seconds:.1} s", counted(sending.sent(), "frame"));
         if left_out > 0 {
             eprint!(", {left_out} of other channels left out");
         }

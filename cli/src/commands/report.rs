@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
+use cantap_trace::counted;
 use cantap_work::atomic_file;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use serde_json::json;
@@ -95,9 +96,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     atomic_file::write(&output, bytes.as_bytes())
         .with_context(|| format!("cannot write {}", output.display()))?;
     eprintln!(
-        "cantap: {}: {} records, {:.1} MB; open it in a browser",
+        "cantap: {}: {}, {:.1} MB; open it in a browser",
         output.display(),
-        read.records,
+        counted(read.records, "record"),
         bytes.len() as f64 / 1e6
     );
     Ok(ExitCode::SUCCESS)

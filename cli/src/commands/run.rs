@@ -16,6 +16,7 @@ use cantap_formats::WriteOptions;
 use cantap_scripts::library::{self, LibraryError, ReadyNode};
 use cantap_scripts::{Bench, BrokenOff, Live, LiveError, Message, Outcome, Report, Script, TestResult};
 use cantap_trace::clean;
+use cantap_trace::counted;
 use cantap_virtual::Options;
 use cantap_work::{atomic_file, interrupt, rounded};
 use serde_json::{Value, json};
@@ -339,20 +340,24 @@ fn print(report: &Report, as_json: bool) -> anyhow::Result<()> {
         let passed = report.tests.len() - failed;
         writeln!(
             out,
-            "{passed} passed, {failed} failed, {} scripts ended with an error; {seconds:.3} s, {} frames sent, {} received",
-            report.errors.len(),
-            report.frames_sent,
+            "{passed} passed, {failed} failed, {} ended with an error; {seconds:.3} s, {} sent, {} received",
+            counted(report.errors.len(), "script"),
+            counted(report.frames_sent, "frame"),
             report.frames_received
         )?;
         if report.frames_not_sent > 0 {
             writeln!(
                 out,
-                "{} frames were not sent: nobody acknowledged them, or their script or the run ended first",
-                report.frames_not_sent
+                "not sent: {}; nobody acknowledged, or the script or the run ended first",
+                counted(report.frames_not_sent, "frame")
             )?;
         }
         if report.frames_lost > 0 {
-            writeln!(out, "at least {} frames were lost; the scripts did not see them", report.frames_lost)?;
+            writeln!(
+                out,
+                "lost: at least {}, which the scripts did not see",
+                counted(report.frames_lost, "frame")
+            )?;
         }
     }
     Ok(out.flush()?)

@@ -25,6 +25,7 @@ use crate::range_args::RangeArgs;
 use crate::trace_output::TraceOutput;
 use crate::usage_error::usage;
 use cantap_trace::Seconds;
+use cantap_trace::counted;
 use cantap_work::missing::Missing;
 use cantap_work::terms::failure_text;
 
@@ -297,11 +298,13 @@ fn describe(event: &TraceEvent) -> String {
         TraceEvent::Frame { frame, .. } => frame.to_string(),
         TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", kind.name()),
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
-        TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
+        TraceEvent::ErrorsSuppressed { count } => counted(count, "more bus error"),
         TraceEvent::State { state, .. } => format!("controller: {}", state.name()),
         TraceEvent::Lost { count: 0, at_least: true, .. } => "an unknown number of frames lost".to_owned(),
-        TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
-        TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
+        TraceEvent::Lost { count, at_least: true, .. } => {
+            format!("at least {count} lost", count = counted(count, "frame"))
+        }
+        TraceEvent::Lost { count, .. } => format!("{count} lost", count = counted(count, "frame")),
         TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),
         TraceEvent::Disturbed { .. } => event.to_string(),
     }

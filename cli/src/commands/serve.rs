@@ -133,9 +133,10 @@ pub struct Args {
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
     /// Serve the page of cantap ui, for browsers on this computer; default 127.0.0.1:29540. Its address, which is printed, has a secret token
-    /// in it. At an address that other computers can reach, or behind https://, with --tls: for browsers that have a client's certificate.
-    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
-    web: Option<String>,
+    /// in it. At an address that other computers can reach, or behind https://, with --tls: for browsers that have a client's certificate. Can be
+    /// repeated.
+    #[arg(long = "web", value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    webs: Vec<String>,
     #[command(flatten)]
     databases: DatabaseArgs,
     /// What clients may do, by the names in their certificates: channels, identifiers, frames per second, modes, hours. The file is
@@ -215,12 +216,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         &args.tunnels,
         addresses.len(),
     )?;
-    if let (None, Some(option)) = (&args.web, args.databases.given()) {
+    if let (true, Some(option)) = (args.webs.is_empty(), args.databases.given()) {
         return Err(usage(format!("{option} is for the page; give --web, too")));
     }
-    let web =
-        args.web.as_deref().map(|text| WebDoor::new(text, &way, &devices, &args.databases)).transpose()?;
-    if way.scheme() == "tls" && tcp.is_none() && !web.as_ref().is_some_and(WebDoor::is_encrypted) {
+    let webs = WebDoor::all(&args.webs, &way, &devices, &args.databases)?;
+    if way.scheme() == "tls" && tcp.is_none() && !webs.iter().any(WebDoor::is_encrypted) {
         return Err(usage("--tls is for --tcp, or for --web at an address of the network; give one of them"));
     }
     #[cfg(feature = "tls")]
@@ -247,10 +247,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], allow(&args.allowed, Door::Stdio));
     }
-    let web = web.map(|web| web.open(&devices, &boards, &args.allowed)).transpose()?;
-    let (url, page) = web.unzip();
+    let opened = webs.into_iter().map(|web| web.open(&devices, &boards, &args.allowed));
+    let (urls, pages): (Vec<_>, Vec<_>) = opened.collect::<anyhow::Result<Vec<_>>>()?.into_iter().unzip();
     let (listening, encrypted) =
-        listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, url.as_deref(), &boards)?;
+        listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &other_doors, &urls, &boards)?;
     #[cfg(feature = "tls")]
     let announcing = args.announce.then(|| announcing::start(&boards, &encrypted)).transpose()?;
     #[cfg(not(feature = "tls"))]
@@ -258,7 +258,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
-    drop((announcing, listening, page));
+    drop((announcing, listening, pages));
     for board in &boards {
         board.end();
     }
@@ -354,7 +354,7 @@ fn listen(
     args: &Args,
     tcp: Option<&(SocketAddr, Way)>,
     other_doors: &OtherDoors,
-    page: Option<&str>,
+    pages: &[String],
     boards: &[Arc<Board>],
 ) -> anyhow::Result<(Vec<Listening>, Vec<SocketAddr>)> {
     let (mut ways, mut encrypted) = (Vec::new(), Vec::new());
@@ -415,7 +415,7 @@ fn listen(
         writeln!(out, "{name}")?;
         ways.push(way);
     }
-    if let Some(page) = page {
+    for page in pages {
         writeln!(out, "{page}")?;
     }
     out.flush()?;

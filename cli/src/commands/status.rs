@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 use cantap::Channel;
 use cantap::wire::message::{ChannelStatus, Failures, Hello, Mode, RegisterSet, Status};
 use cantap_trace::BusErrorKind;
+use cantap_trace::counted;
 use serde_json::{Value, json};
 
 use crate::channel_args::ChannelArgs;
@@ -98,9 +99,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     writeln!(out, "supply       {}", status.supply_millivolts.map_or_else(unknown, volts))?;
     writeln!(
         out,
-        "queue        {} of {} bytes, at most {}",
+        "queue        {} of {}, at most {}",
         status.queue_bytes,
-        device.hello().queue_bytes,
+        counted(device.hello().queue_bytes, "byte"),
         status.queue_high_water_bytes
     )?;
     writeln!(out, "bad requests {}", status.bad_requests)?;
@@ -115,8 +116,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "  last error {}", state.last_error.map_or("none", BusErrorKind::name))?;
         writeln!(
             out,
-            "  received   {} frames; lost: controller {}, queue {}",
-            state.frames,
+            "  received   {}; lost: controller {}, queue {}",
+            counted(state.frames, "frame"),
             if device.hello().counts_losses() {
                 format!("at least {}", state.lost_controller)
             } else {
@@ -126,8 +127,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         )?;
         writeln!(
             out,
-            "  sent       {} frames; failed {}, waiting {}",
-            state.transmitted, state.transmit_failures, state.tx_pending
+            "  sent       {}; failed {}, waiting {}",
+            counted(state.transmitted, "frame"),
+            state.transmit_failures,
+            state.tx_pending
         )?;
         writeln!(out, "  bus errors {}", state.bus_errors)?;
     }

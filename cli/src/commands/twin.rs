@@ -11,6 +11,7 @@ use anyhow::{Context, bail};
 use cantap_scripts::twin::{Distance, Learner, Model, Observed, compare};
 use cantap_scripts::{Bench, Script};
 use cantap_signals::Decoder;
+use cantap_trace::counted;
 use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::{atomic_file, interrupt};
 
@@ -112,8 +113,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A few are stamps that are not quite exact.
     if trace.too_close * 100 > trace.frames() as u64 {
         eprintln!(
-            "cantap: note: {} frames are closer to the one before than the bit rate allows; -b gives the trace's",
-            trace.too_close
+            "cantap: note: {} closer to the one before than the bit rate allows; -b gives the trace's",
+            counted(trace.too_close, "frame")
         );
     }
     let mut out = std::io::stdout().lock();

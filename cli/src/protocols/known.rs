@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use cantap::TraceRecord;
 use cantap_protocols::{Histogram, Overview, Protocol};
+use cantap_trace::counted;
 use serde_json::{Value, json};
 
 use cantap_work::node_text::about;
@@ -75,8 +76,8 @@ impl Known {
         if self.overview.left_out() > 0 {
             let _ = writeln!(
                 out,
-                "  {} events are not counted: too many nodes, services or objects",
-                self.overview.left_out()
+                "  not counted, because there are too many nodes, services or objects: {}",
+                counted(self.overview.left_out(), "event")
             );
         }
         out

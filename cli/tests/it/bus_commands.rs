@@ -61,7 +61,7 @@ fn a_sent_frame_is_printed_with_its_time() {
 fn a_frame_that_nobody_acknowledges_fails_and_says_what_to_check() {
     let (code, out, err) = cantap("send -d virtual:ack=no,load=0 can0 123#");
     assert_eq!((code, out.as_str()), (Some(1), ""));
-    assert!(err.contains("nobody acknowledged 1 of 1 frames; check"), "{err}");
+    assert!(err.contains("nobody acknowledged 1 of 1 frame; check"), "{err}");
     let (code, _, err) = cantap("send -d virtual:ack=no,load=0 can0 123# --one-shot");
     assert!(code == Some(1) && err.contains("--one-shot"), "{err}");
 }

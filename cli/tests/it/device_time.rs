@@ -77,6 +77,34 @@ fn every_format_with_a_place_for_it_keeps_the_devices_time() {
     assert_eq!(run(&folder, "convert f.log - --format csv-full").matches(",Rx,data,").count(), 90);
 }
 
+/// A gateway's delays by a board that is 400 ppm fast; and by two boards, where only UTC can tell.
+#[test]
+fn a_gateways_delay_is_the_devices() {
+    let folder = folder("delay");
+    let table = |of_second: fn(u64) -> u64| {
+        let rows = (0..20_u64).flat_map(|n| {
+            let row = |ms: u64, channel: u8, device_ns: u64| {
+                format!("{}.{:03},{channel},Rx,data,123,2,{n:04X},,{device_ns}\n", ms / 1000, ms % 1000)
+            };
+            let (from, to) = (n * 200, n * 200 + 50);
+            [row(from, 1, 7_000_000_000 + from * 1_000_400), row(to, 2, of_second(to))]
+        });
+        format!("time,channel,direction,type,id,dlc,data,event,device_ns\n{}", rows.collect::<String>())
+    };
+    let delay = |name: &str, text: String| -> serde_json::Value {
+        std::fs::write(folder.join(name), text).unwrap();
+        serde_json::from_str(&run(&folder, &format!("delay {name} --from 1 --to 2 --json"))).unwrap()
+    };
+    let one = delay("one.csv", table(|ms| 7_000_000_000 + ms * 1_000_400));
+    assert_eq!((one["total"]["by_device"].as_u64(), one["total"]["matched"].as_u64()), (Some(20), Some(20)));
+    assert_eq!(one["total"]["delay_ms"]["max"].as_f64(), Some(50.02));
+    let text = run(&folder, "delay one.csv --from 1 --to 2");
+    assert!(text.contains("from end of frame to end of frame, by the device's clock\n"), "{text}");
+    let two = delay("two.csv", table(|ms| 900_000_000_000 + ms * 1_000_000));
+    assert_eq!(two["total"]["by_device"].as_u64(), Some(0));
+    assert_eq!(two["total"]["delay_ms"]["max"].as_f64(), Some(50.0));
+}
+
 /// The board's crystal is 400 ppm fast. UTC is corrected for that, the board's own intervals are not; `stats` measures by these.
 #[cfg(feature = "emu")]
 #[test]

@@ -154,7 +154,7 @@ fn silence_is_explained() {
         assert!(said.contains(part), "{part}: {said}");
     }
     let (code, said) = badly("uds -d virtual:load=0,ack=no -b 500k read F190");
-    assert!(code == Some(1) && said.contains("nobody acknowledged 1 of 1 frames"), "{said}");
+    assert!(code == Some(1) && said.contains("nobody acknowledged 1 of 1 frame"), "{said}");
     let (code, said) = badly("obd -d virtual:load=30 -b 500k");
     assert!(
         code == Some(1) && said.contains("no ECU answers") && said.contains("frames of others"),

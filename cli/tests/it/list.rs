@@ -54,7 +54,7 @@ fn channels_of_makers_libraries_are_listed_once_each_and_cleaned() {
     let peak = "pcan:PCAN_USBBUS1\tPCAN-USB FD (device ID 2Ah)\t-\n\
                 pcan:PCAN_USBBUS2\tPCAN-USB Pro FD\u{FFFD}[2J (device ID 7h)\t-\tanother program has it\n";
     assert!(out.ends_with(&format!("{peak}{LEAF}{VIRTUAL}")), "{out}");
-    assert!(err.contains("1 channels are left out"), "{err}");
+    assert!(err.contains("left out: 1 channel, of kinds"), "{err}");
     let object = object(&folder, "");
     let adapters = object["adapters"].as_array().unwrap();
     assert_eq!(

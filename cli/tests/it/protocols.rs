@@ -83,7 +83,7 @@ fn statistics_tell_response_times_and_nodes() {
     let (_, out, _) = cantap("stats", &logs, &["stats", "bus.log", "--protocols"]);
     assert!(
         out.contains("DiagnosticSessionControl")
-            && out.contains("heartbeat missing (1 times missed, period 100 ms)"),
+            && out.contains("heartbeat missing (1 time missed, period 100 ms)"),
         "{out}"
     );
 }

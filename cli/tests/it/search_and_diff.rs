@@ -135,7 +135,7 @@ fn differences_are_listed() {
     assert_eq!(
         out,
         "channel 1, 123: only in a.log (3 frames)\n\
-         channel 1, 124: only in b.log (1 frames)\n\
+         channel 1, 124: only in b.log (1 frame)\n\
          channel 1, 001: period 2250.000 ms -> 2000.000 ms\n\
          channel 1, 001: byte 0 0x1x000x -> 0x10000x\n\
          channel 1, 002: period 3000.000 ms -> 2000.000 ms\n\

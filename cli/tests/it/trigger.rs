@@ -33,7 +33,7 @@ fn only_what_is_around_the_event_is_kept() {
     let (code, out, err) = cantap("around", &[&["capture", "-n", "60"][..], &trigger].concat());
     assert_eq!(code, Some(0), "{err}");
     assert_eq!(frames(&out), ["001#13", "001#14", "001#15", "001#16"]);
-    assert!(err.contains("trigger: 1 events, 4 records kept\n"), "{err}");
+    assert!(err.contains("trigger: 1 event, 4 records kept\n"), "{err}");
 }
 
 #[test]

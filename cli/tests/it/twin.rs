@@ -77,7 +77,7 @@ fn scripts_that_exist_are_kept_and_what_is_in_none_is_said() {
     // One frame has no load of its own time.
     std::fs::write(at("one.log"), "(1.000000) can0 123#00\n").unwrap();
     let output = cantap(folder.path(), "twin one.log");
-    assert!(text(&output.stdout).contains("1 and 1 frames\nchannel 1: load 0.1"), "{output:?}");
+    assert!(text(&output.stdout).contains("1 and 1 frame\nchannel 1: load 0.1"), "{output:?}");
     std::fs::write(at("empty.log"), "(1.000000) can0 124##0112233\n").unwrap();
     let output = cantap(folder.path(), "twin empty.log");
     assert!(

@@ -4,6 +4,7 @@ use cantap_can::{Frame, Id};
 
 use super::issue::Fault;
 use super::text;
+use cantap_trace::counted;
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent};
 
@@ -133,7 +134,7 @@ impl FrameFields {
             Some(FdFields { brs, esi }) => {
                 let bytes = data.as_slice();
                 let frame = FdFrame::new(self.id, brs, esi, bytes);
-                let found = || format!("{} bytes", bytes.len());
+                let found = || counted(bytes.len(), "byte");
                 frame.ok_or_else(|| Fault::malformed("a length that CAN FD has", found().as_bytes()))?.into()
             }
         };

@@ -15,6 +15,7 @@ use super::table;
 use super::text;
 use super::zone::Zone;
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 use parts::{Packet, Parts, bytes_of, next_line, tokens};
 
 const NO_FRAME: &str = "lines of text without a frame";
@@ -93,7 +94,7 @@ impl Decoder {
         let bytes = if remote { &[] } else { bytes };
         let len = parts.len.unwrap_or(bytes.len());
         if !remote && len != bytes.len() {
-            let found = format!("{} bytes", bytes.len());
+            let found = counted(bytes.len(), "byte");
             return Err(Fault::malformed(format!("{len} data bytes"), found.as_bytes()));
         }
         if remote && len > 15 {

@@ -14,6 +14,7 @@ use super::seek;
 use super::socketcan_packet::{Link, Packet, Packets};
 use super::text::NS_PER_S;
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 use serde::{Deserialize, Serialize};
 
 const MICROSECONDS: u32 = 0xA1B2_C3D4;
@@ -134,7 +135,7 @@ impl Decode for Decoder {
         }
         let head = capture.head(bytes);
         if !capture.is_sane(&head) {
-            let found = format!("{} of {} bytes", head.captured, head.original);
+            let found = format!("{} of {}", head.captured, counted(head.original, "byte"));
             resync(capture, input)?;
             return Ok(Found::Issue(place, Fault::malformed("a packet", found.as_bytes())));
         }

@@ -16,6 +16,7 @@ mod topics;
 use super::error_frames::ErrorFrames;
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::issue::Fault;
+use cantap_trace::counted;
 use cantap_trace::{Direction, TraceEvent};
 use fields::Fields;
 pub(crate) use fields::{Encoding, time_ns};
@@ -62,8 +63,7 @@ pub(crate) fn content(
     bytes: &[u8],
     errors: &mut ErrorFrames,
 ) -> Result<Content, Fault> {
-    let short =
-        || Fault::malformed("a message with a CAN frame", format!("{} bytes", bytes.len()).as_bytes());
+    let short = || Fault::malformed("a message with a CAN frame", counted(bytes.len(), "byte").as_bytes());
     let mut fields = Fields::new(encoding, bytes).ok_or_else(short)?;
     let read = match kind {
         Kind::Frame => Message::classic(&mut fields),

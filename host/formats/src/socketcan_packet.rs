@@ -2,6 +2,7 @@
 //! interface (113 and 276, `tcpdump -i any`).
 
 use cantap_can::{Frame, Id};
+use cantap_trace::counted;
 use serde::{Deserialize, Serialize};
 
 use super::error_frames::ErrorFrames;
@@ -79,7 +80,7 @@ impl Link {
 }
 
 fn short(packet: &[u8]) -> Fault {
-    let found = format!("{} bytes", packet.len());
+    let found = counted(packet.len(), "byte");
     Fault::malformed("a SocketCAN packet of at least 8 bytes", found.as_bytes())
 }
 
@@ -209,8 +210,8 @@ fn flexible(id: u32, len: u8, flags: u8, bytes: &[u8], direction: Direction) -> 
         .get(..usize::from(len))
         .ok_or_else(|| Fault::malformed(format!("{len} data bytes"), present.to_string().as_bytes()))?;
     let frame = FdFrame::new(identifier(id)?, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, data);
-    let frame = frame
-        .ok_or_else(|| Fault::malformed("a length that CAN FD has", format!("{len} bytes").as_bytes()))?;
+    let frame =
+        frame.ok_or_else(|| Fault::malformed("a length that CAN FD has", counted(len, "byte").as_bytes()))?;
     Ok(TraceEvent::Frame { frame: frame.into(), direction, late: false })
 }
 

@@ -5,6 +5,7 @@
 
 use std::io;
 
+use cantap_trace::counted;
 use rusqlite::types::ValueRef;
 use rusqlite::{Connection, OpenFlags, Row};
 
@@ -255,7 +256,7 @@ fn wrong_type(column: usize, expected: &str, found: ValueRef<'_>) -> Fault {
         ValueRef::Integer(number) => number.to_string(),
         ValueRef::Real(number) => number.to_string(),
         ValueRef::Text(text) => String::from_utf8_lossy(text).into_owned(),
-        ValueRef::Blob(bytes) => format!("{} bytes", bytes.len()),
+        ValueRef::Blob(bytes) => counted(bytes.len(), "byte"),
     };
     Fault::malformed(format!("{expected} under {}", COLUMNS[column - 1]), found.as_bytes())
 }

@@ -16,8 +16,8 @@ use super::panda::{self, REJECTED};
 use super::row_format::{Line, RowFormat};
 use super::text;
 use super::zone::Zone;
-use cantap_trace::TraceRecord;
 use cantap_trace::fd::FD_LENGTHS;
+use cantap_trace::{TraceRecord, counted};
 use cells::{byte, direction, id, is_empty, is_list, length, mark, push_bytes};
 use columns::{Form, Role};
 use kind::Kind;
@@ -362,7 +362,7 @@ impl Decoder {
                     || FD_LENGTHS.get(len).is_some_and(|fd| usize::from(*fd) == bytes.len())
             };
             if let Some(len) = len.filter(|len| !fits(*len)) {
-                let found = format!("{} bytes", bytes.len());
+                let found = counted(bytes.len(), "byte");
                 return Err(Fault::malformed(format!("{len} data bytes"), found.as_bytes()));
             }
         } else if let Some(first) = layout.place(Role::Bytes) {
@@ -382,7 +382,7 @@ impl Decoder {
                 }
             }
         }
-        let found = format!("{} bytes", bytes.len());
+        let found = counted(bytes.len(), "byte");
         Payload::of(&bytes)
             .filter(|_| bytes.len() <= 8 || FD_LENGTHS.iter().any(|fd| usize::from(*fd) == bytes.len()))
             .ok_or_else(|| Fault::malformed("a number of bytes that CAN or CAN FD has", found.as_bytes()))

@@ -6,6 +6,7 @@ use super::issue::ReadIssue;
 use super::left_out::LeftOut;
 use super::reader::TraceReader;
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 
 /// So many issues are kept; the others are counted.
 const KEPT: usize = 100;
@@ -56,7 +57,7 @@ impl fmt::Display for Unread {
         }
         let others = self.issues - self.first.len() as u64;
         if others > 0 {
-            writeln!(f, "{others} more places could not be read")?;
+            writeln!(f, "{others} could not be read", others = counted(others, "more place"))?;
         }
         for (what, count) in self.left_out.iter() {
             writeln!(f, "no part of a CAN trace: {what} ({count})")?;

@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::rc::Rc;
 
+use cantap_trace::counted;
 use rhai::{Array, Blob, Dynamic, Engine};
 
 use crate::checksum;
@@ -130,7 +131,10 @@ fn number_bytes(length: i64) -> Result<usize> {
 fn part(data: &[u8], at: i64, length: i64) -> Result<&[u8]> {
     let length = number_bytes(length)?;
     let found = usize::try_from(at).ok().and_then(|at| data.get(at..)?.get(..length));
-    found.ok_or_else(|| format!("there are no {length} bytes at {at}; there are {}", data.len()).into())
+    found.ok_or_else(|| {
+        format!("there are no {length} at {at}; there are {}", data.len(), length = counted(length, "byte"))
+            .into()
+    })
 }
 
 /// Bytes from what scripts have them in: bytes, numbers, texts, and lists of these. Nothing is no bytes.

@@ -8,6 +8,7 @@ use cantap_protocols::active::exchange::{Answerer, Exchange, ResponseTiming};
 use cantap_protocols::active::transfer::TransferSettings;
 use cantap_protocols::iso_tp::Endpoint;
 use cantap_signals::encode;
+use cantap_trace::counted;
 use cantap_trace::grammar::{self, IdPattern};
 use rhai::{Array, Blob, Dynamic, Engine, FnPtr, Map, NativeCallContext};
 
@@ -349,8 +350,8 @@ fn numbered(id: i64) -> Result<Id> {
 }
 
 fn make_frame(id: Id, data: &[u8]) -> Result<ScriptFrame> {
-    let frame =
-        Frame::data_frame(id, data).ok_or_else(|| format!("{} bytes; a frame carries 8", data.len()))?;
+    let frame = Frame::data_frame(id, data)
+        .ok_or_else(|| format!("{}; a frame carries 8", counted(data.len(), "byte")))?;
     Ok(ScriptFrame::new(frame))
 }
 

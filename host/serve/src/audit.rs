@@ -11,6 +11,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
+use cantap_trace::counted;
 use serde_json::{Value, json};
 
 use crate::lock::lock;
@@ -141,7 +142,8 @@ impl Log {
         match self.write(&text) {
             Ok(()) if self.missing > 0 => {
                 let (path, missing) = (self.path.display(), self.missing);
-                (self.trouble)(format!("'{path}' is written to again; {missing} lines are missing in it"));
+                let lines = counted(missing, "line");
+                (self.trouble)(format!("'{path}' is written to again, without {lines}"));
                 self.missing = 0;
             }
             Ok(()) => {}
@@ -313,7 +315,7 @@ mod tests {
         assert!(std::fs::read_to_string(&path).unwrap().contains("\"lines\":3"));
         let told: Vec<String> = told.try_iter().collect();
         assert!(told.len() == 2 && told[0].contains("cannot be written to"), "{told:?}");
-        assert!(told[1].contains("3 lines are missing"), "{told:?}");
+        assert!(told[1].contains("without 3 lines"), "{told:?}");
     }
 
     #[test]

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 use cantap::device::is_idle;
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item, receive};
+use cantap_trace::counted;
 use cantap_wire::Channel;
 use cantap_wire::message::{Mode, Role};
 
@@ -232,7 +233,10 @@ impl End {
             }
         }
         if !rest.is_empty() {
-            faults.push(format!("{} bytes follow the frames that a datagram says it has", rest.len()));
+            faults.push(format!(
+                "{} behind the frames that a datagram says it has",
+                counted(rest.len(), "byte")
+            ));
         }
         for (count, what) in [
             (errors, "error frames"),
@@ -254,7 +258,8 @@ impl End {
         if frames.is_empty() {
             return Ok(());
         }
-        let not_sent = |reason: String, count: usize| format!("{count} frames were not sent: {reason}");
+        let not_sent =
+            |reason: String, count: usize| format!("not sent: {}: {reason}", counted(count, "frame"));
         let Some(session) = &mut self.session else {
             return Err(not_sent("the board is not there".to_owned(), frames.len()));
         };

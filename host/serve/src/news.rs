@@ -3,6 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use cantap_trace::counted;
 use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
@@ -151,6 +152,11 @@ impl News {
     }
 }
 
+/// `1 client sees`, `2 clients see`.
+fn seen_by(clients: usize, noun: &str) -> String {
+    format!("{} {}", counted(clients, noun), if clients == 1 { "sees" } else { "see" })
+}
+
 impl fmt::Display for News {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
@@ -186,17 +192,13 @@ impl fmt::Display for News {
                 f,
                 "channel {} was off its bus for a moment, because {client} may send on it; {} a gap",
                 channel.number(),
-                if *others == 1 {
-                    "1 other client sees".to_owned()
-                } else {
-                    format!("{others} other clients see")
-                }
+                seen_by(*others, "other client")
             ),
             Self::OffBus { client: None, channel, others } => write!(
                 f,
                 "channel {} was off its bus for a moment, and only listens again; {} a gap",
                 channel.number(),
-                if *others == 1 { "1 client sees".to_owned() } else { format!("{others} clients see") }
+                seen_by(*others, "client")
             ),
             // The reason names the board.
             Self::BoardLost { board, reason } if reason.contains(board.as_str()) => {

@@ -7,6 +7,7 @@ mod containers;
 
 use std::collections::{HashMap, HashSet};
 
+use cantap_trace::counted;
 use roxmltree::{Document, Node};
 
 use super::container::Container;
@@ -347,8 +348,12 @@ impl<'a> Reader<'a> {
             let place =
                 at.and_then(|at| at.checked_add(target.offset)).filter(|at| *at < validate::MAX_BYTES * 8);
             let Some(first) = place.filter(|_| length <= 64) else {
-                let reason =
-                    format!("the {} of {}, {length} bits, is not read", name.to_lowercase(), short_name(pdu));
+                let reason = format!(
+                    "the {} of {}, {length}, is not read",
+                    name.to_lowercase(),
+                    short_name(pdu),
+                    length = counted(length, "bit")
+                );
                 self.warn(pdu, target.name, &reason);
                 at = at.and_then(|at| at.checked_add(length));
                 continue;

@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use cantap_can::Id;
+use cantap_trace::counted;
 use serde::Deserialize;
 use toml::Spanned;
 
@@ -308,7 +309,10 @@ fn signal(entry: SignalEntry, line: u32) -> Result<(Signal, Option<When>), Fault
     };
     if entry.initial_raw > layout::mask(length) {
         let raw = entry.initial_raw;
-        return Err(FaultKind::Syntax(format!("initial_raw = {raw} does not fit {length} bits")));
+        return Err(FaultKind::Syntax(format!(
+            "initial_raw = {raw} does not fit {length}",
+            length = counted(length, "bit")
+        )));
     }
     let signal = Signal {
         description: entry.description,

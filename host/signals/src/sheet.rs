@@ -16,6 +16,7 @@ use super::layout::ByteOrder;
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
 use super::unflagged::Unflagged;
 use super::{validate, xml, zip};
+use cantap_trace::counted;
 use cells::{Mux, kind, mux, number, order, range, values};
 use columns::{Columns, Role};
 use place::{Place, Places};
@@ -353,7 +354,7 @@ fn entry(columns: &Columns, row: &[String], line: u32, of: Bits) -> Result<Entry
     };
     let bits = needed(Role::Length, "length")?;
     if bits < 1.0 || bits.fract() != 0.0 {
-        return Err(format!("a length of {bits} bits"));
+        return Err(format!("a length of {bits}", bits = counted(bits, "bit")));
     }
     if bits > 64.0 {
         return Err(format!("{bits} bits are more than a number can have (64)"));

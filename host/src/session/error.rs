@@ -3,6 +3,7 @@
 use std::time::Duration;
 use std::{fmt, io};
 
+use cantap_trace::counted;
 use cantap_wire::message::{EndReason, MAX_FILTERS, MAX_SEND, Mode, Refusal};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS, NoTiming};
 use cantap_wire::{Channel, PROTOCOL_VERSION};
@@ -291,7 +292,8 @@ fn sentence(refusal: Refusal) -> String {
         }
         Refusal::QueueFull { free } => {
             return format!(
-                "its transmit queue has room for {free} more frames only; send fewer at once, or wait"
+                "its transmit queue has room for {free} only; send fewer at once, or wait",
+                free = counted(free, "more frame")
             );
         }
         Refusal::BanksExhausted { needed, available } => {

@@ -46,19 +46,59 @@ pub struct Moment {
     pub device_ns: Option<DeviceNs>,
 }
 
+/// How long something took.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Interval {
+    /// Nanoseconds.
+    pub ns: i64,
+    /// Whether a device measured it. Otherwise it is a difference of UTC, which is corrected while a trace is recorded.
+    pub by_device: bool,
+}
+
 impl Moment {
-    /// How long after `earlier` it was, in nanoseconds: as the device measured it if both have its time; otherwise, and if the two clocks
-    /// disagree so much that the device was restarted or replaced in between, by UTC. Negative if `earlier` was later.
+    /// How long after `earlier` it was: as the device measured it if both have its time; otherwise, and if the two clocks disagree so much
+    /// that the device was restarted or replaced in between, or that two devices stamped them, by UTC. Negative if `earlier` was later.
+    #[inline]
+    pub fn interval_since(self, earlier: Self) -> Interval {
+        /// What no crystal, no RC oscillator and no correction towards UTC is off by: one part in this many. The constant is for stamps in
+        /// microseconds; it bounds the error if two devices' clocks happen to agree.
+        const PARTS: u64 = 50;
+        const CONSTANT_NS: u64 = 20_000;
+        let by_utc = Interval { ns: self.time_ns.saturating_sub(earlier.time_ns), by_device: false };
+        let (Some(now), Some(then)) = (self.device_ns, earlier.device_ns) else { return by_utc };
+        let by_device = Interval { ns: now.get().wrapping_sub(then.get()).cast_signed(), by_device: true };
+        let is_one_clock = by_device.ns.abs_diff(by_utc.ns) <= by_utc.ns.unsigned_abs() / PARTS + CONSTANT_NS;
+        if is_one_clock { by_device } else { by_utc }
+    }
+
+    /// The moment of a time by UTC among stamped ones: `earlier` are those before it, `later` those from it on, the nearest first. The
+    /// device's time is what it was between the nearest of both that have it, if they are of one clock. Not more than 64 of each are
+    /// looked at.
+    pub fn at(
+        time_ns: i64,
+        earlier: impl IntoIterator<Item = Self>,
+        later: impl IntoIterator<Item = Self>,
+    ) -> Self {
+        const NEAR: usize = 64;
+        let by_utc = Self { time_ns, device_ns: None };
+        let is_known = |moment: &Self| moment.device_ns.is_some();
+        let Some(after) = later.into_iter().take(NEAR).find(is_known) else { return by_utc };
+        if after.time_ns == time_ns {
+            return after;
+        }
+        let Some(before) = earlier.into_iter().take(NEAR).find(is_known) else { return by_utc };
+        let whole = after.interval_since(before);
+        let (Some(device_ns), true) = (before.device_ns, whole.by_device) else { return by_utc };
+        let part = i128::from(time_ns.saturating_sub(before.time_ns));
+        let utc = i128::from(after.time_ns.saturating_sub(before.time_ns)).max(1);
+        let passed = (i128::from(whole.ns) * part / utc) as i64;
+        Self { time_ns, device_ns: DeviceNs::new(device_ns.get().wrapping_add_signed(passed)) }
+    }
+
+    /// The nanoseconds of [`Self::interval_since`].
     #[inline]
     pub fn since_ns(self, earlier: Self) -> i64 {
-        /// What no crystal, no RC oscillator and no correction towards UTC is off by: one part in this many, and a constant.
-        const PARTS: u64 = 50;
-        const CONSTANT_NS: u64 = 1_000_000;
-        let by_utc = self.time_ns.saturating_sub(earlier.time_ns);
-        let (Some(now), Some(then)) = (self.device_ns, earlier.device_ns) else { return by_utc };
-        let by_device = now.get().wrapping_sub(then.get()).cast_signed();
-        let is_one_clock = by_device.abs_diff(by_utc) <= by_utc.unsigned_abs() / PARTS + CONSTANT_NS;
-        if is_one_clock { by_device } else { by_utc }
+        self.interval_since(earlier).ns
     }
 }
 
@@ -91,6 +131,28 @@ mod tests {
         assert_eq!(at(2_000_010_000, 0).since_ns(at(1_000_000_000, 4_000_000_000)), 1_000_010_000);
     }
 
+    #[test]
+    fn a_time_between_stamps_is_the_devices_too() {
+        // 400 ppm fast, every 10 ms, and one in three without the device's time.
+        let all: Vec<_> = (0..30_i64)
+            .map(|n| at(n * 10_000_000, if n % 3 == 0 { 0 } else { 7_000_000_000 + n as u64 * 10_004_000 }))
+            .collect();
+        let moment = |time_ns: i64| {
+            let place = all.partition_point(|moment| moment.time_ns < time_ns);
+            Moment::at(time_ns, all[..place].iter().rev().copied(), all[place..].iter().copied())
+        };
+        for ms in [10, 15, 30, 33, 277] {
+            let expected = 7_000_000_000 + ms * 1_000_400;
+            assert_eq!(DeviceNs::or_zero(moment(ms as i64 * 1_000_000).device_ns), expected, "{ms}");
+        }
+        for ms in [-1, 5, 285, 1000] {
+            assert_eq!(moment(ms * 1_000_000), at(ms * 1_000_000, 0));
+        }
+        // Not between two devices.
+        let two = |time_ns| Moment::at(time_ns, [at(0, 5_000_000)], [at(10_000_000, 900_000_000)]);
+        assert_eq!(two(4_000_000), at(4_000_000, 0));
+    }
+
     /// Its clock began again, or another device went on.
     #[test]
     fn clocks_that_contradict_each_other_are_not_one_clock() {
@@ -98,6 +160,22 @@ mod tests {
         assert_eq!(at(3_000_000_000, 1_500_000_000).since_ns(before), 2_000_000_000);
         assert_eq!(at(3_000_000_000, 990_000_000_000).since_ns(before), 2_000_000_000);
         assert_eq!(at(i64::MAX, u64::MAX).since_ns(at(i64::MIN, 1)), i64::MAX);
+        // Two boards that were switched on within half a millisecond.
+        let other = at(1_000_000_000, 900_000_500_000);
+        assert_eq!(at(1_005_000_000, 900_005_000_000).since_ns(other), 5_000_000);
+    }
+
+    #[test]
+    fn an_interval_tells_whose_it_is() {
+        let before = at(1_000_000_000, 4_000_000_000);
+        assert_eq!(
+            at(2_000_000_000, 5_000_400_000).interval_since(before),
+            Interval { ns: 1_000_400_000, by_device: true }
+        );
+        assert_eq!(
+            at(2_000_000_000, 0).interval_since(before),
+            Interval { ns: 1_000_000_000, by_device: false }
+        );
     }
 
     /// A fiftieth, and a millisecond: what is between is a slow or fast clock, what is beyond is another one.

@@ -1,5 +1,6 @@
 //! What a record says if it is no frame, as one line.
 
+use crate::counted;
 use std::borrow::Cow;
 use std::fmt;
 
@@ -12,7 +13,7 @@ pub fn failure_text(reason: TransmitFailure) -> Cow<'static, str> {
     match reason {
         TransmitFailure::Overtaken { periods: 1 } => "overtaken: its next period came first".into(),
         TransmitFailure::Overtaken { periods } => {
-            format!("overtaken: its next {periods} periods came first").into()
+            format!("overtaken: its next {periods} came first", periods = counted(periods, "period")).into()
         }
         TransmitFailure::Loop => "loop: both channels of the gateway are on one bus, and it has ended".into(),
         reason => reason.name().into(),
@@ -40,11 +41,11 @@ impl fmt::Display for TraceEvent {
             Self::BusError { kind, counters: at } => {
                 write!(f, "bus error: {}{}", kind.map_or("unknown", BusErrorKind::name), counters(at))
             }
-            Self::ErrorsSuppressed { count } => write!(f, "{count} more bus errors"),
+            Self::ErrorsSuppressed { count } => f.write_str(&counted(count, "more bus error")),
             Self::State { state, counters: at } => write!(f, "controller {}{}", state.name(), counters(at)),
             Self::Lost { stage, count, at_least } => {
                 let stage = stage.map_or("unknown", LossStage::name);
-                write!(f, "{} frames lost ({stage})", lost(count, at_least))
+                write!(f, "{} lost ({stage})", counted(lost(count, at_least), "frame"))
             }
             Self::TransmitFailed { tag, reason } => {
                 write!(f, "frame {tag} not sent: {}", failure_text(reason))

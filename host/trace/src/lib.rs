@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 pub mod clean;
+mod counted;
 mod device_time;
 pub mod diff;
 pub mod event_text;
@@ -31,7 +32,8 @@ pub use cantap_can::{
     BusErrorKind, Channel, ErrorState, Frame, FrameBits, Id, LossStage, TransmitFailure, bits, bits_on_bus,
     fd,
 };
-pub use device_time::{DeviceNs, Moment};
+pub use counted::counted;
+pub use device_time::{DeviceNs, Interval, Moment};
 pub use fd::FdFrame;
 pub use fd_bits::FdBits;
 pub use frame::{ParseTraceFrameError, TraceFrame};

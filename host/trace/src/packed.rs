@@ -1,11 +1,13 @@
 //! Records as bytes, for a stream between two programs of one version, such as a server and its page. It is no file format: nothing in it
 //! says which version wrote it.
 //!
-//! A frame of eight bytes takes about fifteen. Each record is its kind and flags (1 byte), its channel (1 byte), the nanoseconds since the
-//! record before (the first one's since 0; zigzag, seven bits in each byte), and what is particular to its kind.
+//! A frame of eight bytes takes about sixteen. Each record is its kind and flags (1 byte), its channel (1 byte), the nanoseconds since the
+//! record before (the first one's since 0; zigzag, seven bits in each byte), by how much more the device's clock has advanced than UTC
+//! if the record has the device's time (likewise: one byte, most often), and what is particular to its kind.
 
 use cantap_can::{BusErrorKind, ErrorState, Frame, Id, LossStage, TransmitFailure};
 
+use crate::device_time::DeviceNs;
 use crate::fd::FD_LENGTHS;
 use crate::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -32,6 +34,16 @@ const LATE: u8 = 1 << 6;
 const COUNTERS: u8 = 1 << 4;
 /// There may have been more losses.
 const AT_LEAST: u8 = 1 << 4;
+/// Of every kind: the device's time is known.
+const DEVICE: u8 = 1 << 7;
+
+/// The record before, as far as the next one is a difference to it.
+#[derive(Clone, Copy, Default)]
+struct Before {
+    time_ns: i64,
+    /// The device's time less UTC, of the last record that has both; wraps.
+    ahead_ns: i64,
+}
 
 /// What was read is no record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -45,17 +57,22 @@ pub struct Damaged {
 
 /// Appends records to `out`.
 pub fn write(records: &[TraceRecord], out: &mut Vec<u8>) {
-    let mut before_ns = 0_i64;
+    let mut before = Before::default();
     for record in records {
-        write_one(record, before_ns, out);
-        before_ns = record.time_ns;
+        write_one(record, &mut before, out);
     }
 }
 
-fn write_one(record: &TraceRecord, before_ns: i64, out: &mut Vec<u8>) {
-    let begin = |out: &mut Vec<u8>, kind: u8| {
-        out.extend([kind, record.channel]);
-        varint(zigzag(record.time_ns.wrapping_sub(before_ns)), out);
+fn write_one(record: &TraceRecord, before: &mut Before, out: &mut Vec<u8>) {
+    let mut begin = |out: &mut Vec<u8>, kind: u8| {
+        out.extend([kind | flag(record.device_ns.is_some(), DEVICE), record.channel]);
+        varint(zigzag(record.time_ns.wrapping_sub(before.time_ns)), out);
+        before.time_ns = record.time_ns;
+        if let Some(device_ns) = record.device_ns {
+            let ahead_ns = device_ns.get().cast_signed().wrapping_sub(record.time_ns);
+            varint(zigzag(ahead_ns.wrapping_sub(before.ahead_ns)), out);
+            before.ahead_ns = ahead_ns;
+        }
     };
     let counters = |at: Option<(u8, u8)>, out: &mut Vec<u8>| {
         out.extend(at.map(|(tec, rec)| [tec, rec]).into_iter().flatten());
@@ -141,11 +158,10 @@ fn varint(mut value: u64, out: &mut Vec<u8>) {
 /// If the bytes are anything else.
 pub fn read(bytes: &[u8], mut take: impl FnMut(&TraceRecord)) -> Result<(), Damaged> {
     let mut rest = Rest(bytes);
-    let mut before_ns = 0_i64;
+    let mut before = Before::default();
     while !rest.0.is_empty() {
         let at = bytes.len() - rest.0.len();
-        let record = rest.record(before_ns).ok_or(Damaged { at, len: bytes.len() })?;
-        before_ns = record.time_ns;
+        let record = rest.record(&mut before).ok_or(Damaged { at, len: bytes.len() })?;
         take(&record);
     }
     Ok(())
@@ -205,11 +221,22 @@ impl<'a> Rest<'a> {
         Some(Some((self.byte()?, self.byte()?)))
     }
 
-    fn record(&mut self, before_ns: i64) -> Option<TraceRecord> {
+    fn difference(&mut self) -> Option<i64> {
+        let zigzag = self.varint()?;
+        Some((zigzag >> 1) as i64 ^ -((zigzag & 1) as i64))
+    }
+
+    fn record(&mut self, before: &mut Before) -> Option<TraceRecord> {
         let first = self.byte()?;
         let channel = self.byte()?;
-        let passed = self.varint()?;
-        let time_ns = before_ns.wrapping_add((passed >> 1) as i64 ^ -((passed & 1) as i64));
+        let time_ns = before.time_ns.wrapping_add(self.difference()?);
+        before.time_ns = time_ns;
+        let device_ns = if first & DEVICE == 0 {
+            None
+        } else {
+            before.ahead_ns = before.ahead_ns.wrapping_add(self.difference()?);
+            Some(DeviceNs::new(time_ns.wrapping_add(before.ahead_ns).cast_unsigned())?)
+        };
         let event = match first & KIND {
             kind @ (DATA | REMOTE | FD..) => self.frame(kind, first)?,
             BUS_ERROR => {
@@ -236,7 +263,7 @@ impl<'a> Rest<'a> {
             }
             DISTURBED => TraceEvent::Disturbed { length_ns: self.u32()? },
         };
-        Some(TraceRecord { time_ns, device_ns: None, channel, event })
+        Some(TraceRecord { time_ns, device_ns, channel, event })
     }
 
     fn frame(&mut self, kind: u8, flags: u8) -> Option<TraceEvent> {
@@ -263,7 +290,7 @@ impl<'a> Rest<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{data_record, record_or_fd};
+    use crate::testing::{data_record, record_or_fd, with_device_time};
     use proptest::prelude::*;
 
     fn read_all(bytes: &[u8]) -> (Vec<TraceRecord>, Result<(), Damaged>) {
@@ -274,7 +301,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn records_come_out_as_they_went_in(records in prop::collection::vec(record_or_fd(1), 0..40)) {
+        fn records_come_out_as_they_went_in(records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..40)) {
             let mut bytes = Vec::new();
             write(&records, &mut bytes);
             prop_assert_eq!(read_all(&bytes), (records, Ok(())));
@@ -282,7 +309,7 @@ mod tests {
 
         #[test]
         fn what_is_before_a_cut_is_read_and_the_cut_is_reported(
-            records in prop::collection::vec(record_or_fd(1), 1..10),
+            records in prop::collection::vec(with_device_time(record_or_fd(1)), 1..10),
             cut in any::<prop::sample::Index>(),
         ) {
             let mut bytes = Vec::new();
@@ -303,13 +330,22 @@ mod tests {
     }
 
     #[test]
-    fn a_frame_of_eight_bytes_takes_about_fifteen() {
+    fn a_frame_of_eight_bytes_takes_about_sixteen() {
         let records: Vec<_> =
             (0..100).map(|n| data_record(1_800_000_000_000_000_000 + n * 250_000)).collect();
         let mut bytes = Vec::new();
         write(&records, &mut bytes);
         // Of four data bytes: kind, channel, three of time, two of the identifier, the length.
         assert_eq!(bytes.len(), 12 * 100 + 6);
+        // And one for a device's clock that is 400 ppm fast.
+        let with_device: Vec<_> = (1..)
+            .zip(&records)
+            .map(|(n, record)| TraceRecord { device_ns: DeviceNs::new(n * 250_100), ..*record })
+            .collect();
+        bytes.clear();
+        write(&with_device, &mut bytes);
+        assert!((13 * 100..=15 * 100).contains(&bytes.len()), "{}", bytes.len());
+        assert_eq!(read_all(&bytes), (with_device, Ok(())));
     }
 
     #[test]

@@ -2,15 +2,18 @@
 //! is bounded: the oldest goes first, and a page that had not taken it is given a loss in its place, with the number of frames on each channel.
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::ops::Range;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use cantap_trace::{LossStage, TraceEvent, TraceRecord, packed};
 
 /// Most bytes of packed records: minutes of two saturated buses.
 const MOST_BYTES: usize = 64 << 20;
-/// What a chunk takes besides its records: its places in the ring, itself, the head of its records and the counts before it, each with what
-/// the allocator takes.
-const CHUNK_BYTES: usize = 16 + (size_of::<Chunk>() + 16) + (16 + 16) + (2 * size_of::<(u8, u64)>() + 16);
+/// Records are kept in segments of so many bytes, and the oldest one's memory is the next one's: whatever the size of chunks, which changes with the
+/// computer's load, nothing is left in between that fits none of them.
+const SEGMENT_BYTES: usize = 256 << 10;
+/// What a chunk takes besides its records: its places in the ring, itself and the counts before it, each with what the allocator takes.
+const CHUNK_BYTES: usize = 16 + (size_of::<Chunk>() + 16) + (2 * size_of::<(u8, u64)>() + 16);
 
 /// Frames of each channel, by its number.
 type Frames = Vec<(u8, u64)>;
@@ -25,6 +28,12 @@ pub struct Backlog {
 struct State {
     /// Boxed: a ring grows to twice its size at once, and that is then little.
     chunks: VecDeque<Box<Chunk>>,
+    segments: VecDeque<Vec<u8>>,
+    /// The number of the first of them.
+    first_segment: u64,
+    /// An empty one, for the next.
+    spare: Option<Vec<u8>>,
+    /// What all this takes.
     bytes: usize,
     /// The number of records so far.
     next: u64,
@@ -34,10 +43,52 @@ struct State {
 struct Chunk {
     first: u64,
     next: u64,
-    packed: Arc<[u8]>,
+    /// Where its packed records are: the number of the segment, and the place in it.
+    segment: u64,
+    place: Range<usize>,
     first_ns: i64,
     /// Frames before it.
     before: Frames,
+}
+
+impl State {
+    /// Adds packed records. Returns where they are.
+    fn store(&mut self, packed: &[u8]) -> (u64, Range<usize>) {
+        let has_room = |segment: &Vec<u8>| segment.len() + packed.len() <= SEGMENT_BYTES;
+        if !self.segments.back().is_some_and(has_room) {
+            let spare = self.spare.take().filter(|_| packed.len() <= SEGMENT_BYTES);
+            let empty = spare.unwrap_or_else(|| Vec::with_capacity(packed.len().max(SEGMENT_BYTES)));
+            self.bytes += empty.capacity();
+            self.segments.push_back(empty);
+        }
+        let number = self.first_segment + self.segments.len() as u64 - 1;
+        let Some(segment) = self.segments.back_mut() else { return (number, 0..0) };
+        let from = segment.len();
+        segment.extend_from_slice(packed);
+        (number, from..segment.len())
+    }
+
+    /// The packed records of a chunk.
+    fn packed(&self, chunk: &Chunk) -> &[u8] {
+        let segment = self.segments.get((chunk.segment - self.first_segment) as usize);
+        segment.and_then(|segment| segment.get(chunk.place.clone())).unwrap_or_default()
+    }
+
+    /// Forgets the oldest chunk, and the segments before the one that follows.
+    fn forget_oldest(&mut self) {
+        let Some(oldest) = self.chunks.pop_front() else { return };
+        self.bytes -= CHUNK_BYTES;
+        let needed = self.chunks.front().map_or(oldest.segment, |chunk| chunk.segment);
+        while self.first_segment < needed
+            && let Some(mut segment) = self.segments.pop_front()
+        {
+            self.first_segment += 1;
+            self.bytes -= segment.capacity();
+            // One that a large chunk has made larger is given back.
+            segment.clear();
+            self.spare = Some(segment).filter(|segment| segment.capacity() == SEGMENT_BYTES);
+        }
+    }
 }
 
 /// How far a page has taken.
@@ -100,46 +151,30 @@ impl Backlog {
                 None => state.frames.push((record.channel, 1)),
             }
         }
+        let (segment, place) = state.store(&packed);
         let chunk = Chunk {
             first: state.next,
             next: state.next + records.len() as u64,
-            packed: packed.into(),
+            segment,
+            place,
             first_ns: first.time_ns,
             before,
         };
         state.next = chunk.next;
-        state.bytes += chunk.packed.len() + CHUNK_BYTES;
+        state.bytes += CHUNK_BYTES;
         state.chunks.push_back(Box::new(chunk));
         while state.bytes > self.most_bytes && state.chunks.len() > 1 {
-            let Some(oldest) = state.chunks.pop_front() else { return };
-            state.bytes -= oldest.packed.len() + CHUNK_BYTES;
+            state.forget_oldest();
         }
     }
 
     /// What comes after the cursor, in about `most_bytes`, and moves the cursor behind it; `None` if there is nothing.
     pub fn take(&self, cursor: &mut Cursor, most_bytes: usize) -> Option<Taken> {
-        let (found, latest, frames_after) = {
-            let state = self.lock();
-            // Whoever comes back with a number of the future has it from elsewhere.
-            let from = state.chunks.partition_point(|chunk| chunk.next <= cursor.next);
-            let mut bytes = 0;
-            let mut fits = |chunk: &Chunk| {
-                let is_first = bytes == 0;
-                bytes += chunk.packed.len() + 4;
-                is_first || bytes <= most_bytes
-            };
-            let found: Vec<_> = state.chunks.range(from..).take_while(|chunk| fits(chunk)).collect();
-            let last = found.last()?.next;
-            let after =
-                state.chunks.get(from + found.len()).map_or(&state.frames, |chunk| &chunk.before).clone();
-            let found: Vec<_> = found
-                .iter()
-                .map(|chunk| (chunk.first, Arc::clone(&chunk.packed), chunk.first_ns, chunk.before.clone()))
-                .collect();
-            (found, (state.next, last), after)
-        };
-        let (first, _, first_ns, before) = found.first()?;
-        let gone = first.saturating_sub(cursor.next);
+        let state = self.lock();
+        // Whoever comes back with a number of the future has it from elsewhere.
+        let from = state.chunks.partition_point(|chunk| chunk.next <= cursor.next);
+        let first = state.chunks.get(from)?;
+        let gone = first.first.saturating_sub(cursor.next);
         let mut chunks = Vec::new();
         let mut add = |packed: &[u8]| {
             chunks.extend_from_slice(&(packed.len() as u32).to_le_bytes());
@@ -147,14 +182,23 @@ impl Backlog {
         };
         if gone > 0 {
             let mut packed = Vec::new();
-            packed::write(&losses(before, cursor.frames.as_deref(), *first_ns), &mut packed);
+            packed::write(&losses(&first.before, cursor.frames.as_deref(), first.first_ns), &mut packed);
             add(&packed);
         }
-        for (_, packed, ..) in &found {
-            add(packed);
+        let (mut bytes, mut next) = (0, cursor.next);
+        let mut frames = &state.frames;
+        for chunk in state.chunks.range(from..) {
+            let is_first = bytes == 0;
+            bytes += chunk.place.len() + 4;
+            if !is_first && bytes > most_bytes {
+                frames = &chunk.before;
+                break;
+            }
+            add(state.packed(chunk));
+            next = chunk.next;
         }
-        let taken = Taken { first: *first, latest: latest.0, chunks, gone };
-        *cursor = Cursor { next: latest.1, frames: Some(frames_after) };
+        let taken = Taken { first: first.first, latest: state.next, chunks, gone };
+        *cursor = Cursor { next, frames: Some(frames.clone()) };
         Some(taken)
     }
 }
@@ -216,6 +260,25 @@ mod tests {
             assert_eq!(got, all);
         }
         assert_eq!(backlog.take(&mut Cursor::at(5000), 100), None);
+    }
+
+    /// Their size changes with the computer's load: what was freed must fit what comes, or the memory grows.
+    #[test]
+    fn memory_does_not_depend_on_how_many_records_come_at_a_time() {
+        const MOST: usize = 4 << 20;
+        let backlog = Backlog::with_bytes(MOST);
+        let mut time_ns = 0;
+        for at_a_time in [40, 23, 12, 40, 1, 3000, 40, 30_000, 7] {
+            for _ in 0..600_000 / at_a_time {
+                let records: Vec<_> = (0..at_a_time).map(|n| on(1, time_ns + n)).collect();
+                time_ns += at_a_time;
+                backlog.push(&records);
+            }
+            let state = backlog.lock();
+            let held: usize = state.segments.iter().chain(&state.spare).map(Vec::capacity).sum();
+            let taken = held + state.chunks.len() * CHUNK_BYTES;
+            assert!((MOST - 1_000_000..=MOST + SEGMENT_BYTES).contains(&taken), "{at_a_time}: {taken}");
+        }
     }
 
     #[test]

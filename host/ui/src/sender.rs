@@ -7,6 +7,7 @@ use cantap::periodic;
 use cantap::wire::message::{Periodic, TxFrame};
 use cantap::{Channel, Frame};
 use cantap_signals::Decoder;
+use cantap_trace::counted;
 use cantap_trace::grammar;
 use cantap_work::channels::place_of;
 use cantap_work::live::{Line, Lines};
@@ -70,8 +71,12 @@ pub fn start(
     let in_use = |slot: u8| entries.iter().any(|entry| (entry.channel, entry.slot) == (number, slot));
     let slots = device.hello().periodic_slots;
     let slot = (0..slots).find(|slot| !in_use(*slot));
-    let slot = slot
-        .with_context(|| format!("the device repeats {slots} frames on a channel; stop another one first"))?;
+    let slot = slot.with_context(|| {
+        format!(
+            "the device repeats {slots} on a channel; stop another one first",
+            slots = counted(slots, "frame")
+        )
+    })?;
     device.set_periodic(channel, slot, Some(Periodic { frame, period_ticks, count: 0, modifiers }))?;
     Ok(PeriodicState { channel: number, slot, frame: frame.to_string(), period_ms })
 }

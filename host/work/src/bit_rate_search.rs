@@ -9,6 +9,7 @@ use cantap::autobaud::{self, Limits, Outcome, Progress};
 use cantap::wire::message::{ChannelConfig, capability};
 use cantap::{Channel, Device, DeviceError};
 use cantap_address::Address;
+use cantap_trace::counted;
 
 use crate::remembered_rates::RememberedRates;
 
@@ -205,7 +206,8 @@ pub fn failure(outcome: Outcome, number: u8, seconds: f64) -> String {
             };
             format!(
                 "a bit on channel {number} is one of {bitrate_bps} bit/s (measured: {measured_bps:.0}), but no good frame followed, and \
-                 {errors} errors; {why}"
+                 {errors}; {why}",
+                errors = counted(errors, "error")
             )
         }
         Outcome::Stopped | Outcome::Found { .. } => "stopped before a bit rate was found".to_owned(),

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use anyhow::bail;
 use cantap_address::Address;
 use cantap_signals::{Database, DatabaseError, Decoder, Override, Source};
+use cantap_trace::counted;
 
 use crate::report::Reporter;
 
@@ -189,7 +190,8 @@ fn warn(database: &Database, reporter: &Reporter) {
     if more > 0 {
         let file = &database.file;
         reporter.note(format!(
-            "{file}: and {more} more warnings; `cantap db {file} --warnings` lists all, --quiet hides them"
+            "{file}: and {more}; `cantap db {file} --warnings` lists all, --quiet hides them",
+            more = counted(more, "more warning")
         ));
     }
 }
@@ -198,10 +200,11 @@ fn warn(database: &Database, reporter: &Reporter) {
 fn overrides(decoder: &Decoder) -> impl Iterator<Item = String> {
     decoder.overrides().iter().map(|Override { file, by, messages }| {
         let count = messages.len();
-        let s = if count == 1 { "" } else { "s" };
+        let identifiers = if count == 1 { "identifier" } else { "identifiers" };
         let first = messages.first().map_or("", String::as_str);
         let such_as = if count == 1 { "" } else { "such as " };
-        format!("{by} replaces {count} message{s} of {file} with the same identifier{s}, {such_as}{first}")
+        let messages = counted(count, "message");
+        format!("{by} replaces {messages} of {file} with the same {identifiers}, {such_as}{first}")
     })
 }
 

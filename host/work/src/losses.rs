@@ -1,6 +1,7 @@
 //! Losses by stage, as the JSON objects and summaries show them.
 
 use cantap::device::Counters;
+use cantap_trace::counted;
 
 /// Frames lost at each stage, on both channels together.
 #[derive(Clone, Copy, Default, serde::Serialize)]
@@ -77,12 +78,14 @@ impl Losses {
         let stages = match unknown {
             0 => stages,
             1 => format!("{stages}, and an unknown number"),
-            places => format!("{stages}, and an unknown number at {places} places"),
+            places => {
+                format!("{stages}, and an unknown number at {places}", places = counted(places, "place"))
+            }
         };
         if *off_bus == 0 {
             return stages;
         }
-        let times = if *off_bus == 1 { "once".to_owned() } else { format!("{off_bus} times") };
+        let times = if *off_bus == 1 { "once".to_owned() } else { counted(off_bus, "time") };
         format!(
             "{stages}, off the bus an unknown number, {times}, {:.1} ms in total",
             *off_bus_us as f64 / 1e3

@@ -1,6 +1,7 @@
 //! What is missing from the records read or written, counted by kind.
 
 use cantap_formats::{LeftOut, TraceReader};
+use cantap_trace::counted;
 use serde_json::{Map, Value};
 
 /// Counts by kind, as in the JSON objects.
@@ -58,7 +59,7 @@ impl Missing {
         let places = match self.issues {
             0 => None,
             1 => Some("1 place could not be read".to_owned()),
-            issues => Some(format!("{issues} places could not be read")),
+            issues => Some(format!("{issues} could not be read", issues = counted(issues, "place"))),
         };
         let kinds: Vec<_> = self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
         let kinds = (!kinds.is_empty()).then(|| format!("no part of a CAN trace: {}", kinds.join(", ")));

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use cantap_protocols::KnownNode;
+use cantap_trace::counted;
 
 /// Faults, state, identity and codes, as far as there are any.
 pub fn about(known: &KnownNode) -> String {
@@ -14,7 +15,7 @@ pub fn about(known: &KnownNode) -> String {
         let _ = write!(about, ", {state}");
     }
     if known.missed > 0 {
-        let _ = write!(about, " ({} times missed", known.missed);
+        let _ = write!(about, " ({} missed", counted(known.missed, "time"));
         if let Some(period_ms) = known.period_ms {
             let _ = write!(about, ", period {period_ms:.0} ms");
         }

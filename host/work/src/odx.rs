@@ -7,9 +7,9 @@ use std::sync::Arc;
 
 use anyhow::Context as _;
 use cantap_protocols::odx::{Descriptions, Odx, Source, is_document};
+use cantap_trace::counted;
 
 use crate::report::Reporter;
-use crate::terms::counted;
 
 /// The largest file that is looked at, packed or not.
 const MOST_BYTES: u64 = 512 << 20;

@@ -8,6 +8,7 @@ use cantap_formats::{ChannelInfo, Format, LeftOut, TraceWriter, WriteOptions, cr
 use cantap_signals::Decoder;
 use cantap_signals::trigger::{Trigger, TriggerCounts, Window};
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 
 use crate::advice;
 
@@ -216,11 +217,9 @@ impl Recording {
                 );
             }
         };
-        if without.is_empty() {
-            format!("{records} records are in {path}")
-        } else {
-            format!("{records} records are in {path}, without {}", without.join(", "))
-        }
+        let are_in =
+            format!("{} {} in {path}", counted(records, "record"), if records == 1 { "is" } else { "are" });
+        if without.is_empty() { are_in } else { format!("{are_in}, without {}", without.join(", ")) }
     }
 
     /// A sentence about the error that ended a recording.

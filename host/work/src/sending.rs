@@ -14,6 +14,7 @@ use cantap::unsent::{Cause, PATIENCE, Watch};
 use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceFrame, TraceRecord};
+use cantap_trace::counted;
 
 use crate::advice::sentence;
 use crate::bus_off::BusOffRecovery;
@@ -389,8 +390,9 @@ impl Outcome {
         let again = if self.is_one_shot { ", or omit --one-shot to try again until sent" } else { "" };
         Some(match self.cause? {
             Cause::Unacknowledged => format!(
-                "nobody acknowledged {not_sent} of {asked} frames; check that another node is on the bus, at this bit rate, \
-                 and the termination{again}"
+                "nobody acknowledged {not_sent} of {asked}; check that another node is on the bus, at this bit rate, \
+                 and the termination{again}",
+                asked = counted(asked, "frame")
             ),
             Cause::Destroyed => {
                 format!("{were_not}: errors destroyed them; check bit rate and wiring{again}")
@@ -410,8 +412,9 @@ impl Outcome {
                 format!("{were_not}: arbitration was lost; omit --one-shot to try again until sent")
             }
             Cause::Overtaken if *not_sent == 0 => format!(
-                "all {asked} frames were sent, but {overtaken} periods passed without one: their period is shorter than the \
-                 bus allows; choose a longer --period"
+                "all {asked} frames were sent, but {overtaken} passed without one: their period is shorter than the \
+                 bus allows; choose a longer --period",
+                overtaken = counted(overtaken, "period")
             ),
             Cause::Overtaken => {
                 format!("{were_not}: their period is shorter than the bus allows; choose a longer --period")

@@ -15,13 +15,13 @@ use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
 use cantap_address::OpenDevice;
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
+use cantap_trace::counted;
 
 use crate::bus_hints::{BusHint, HintPlace};
 use crate::bus_off::BusOffRecovery;
 use crate::interrupt;
 use crate::reception::Reception;
 use crate::sending::Sending;
-use crate::terms::counted;
 
 /// The longest time between two checks of what is being sent, and of Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -377,7 +377,11 @@ impl<'d> Speaking<'d> {
                 write!(text, "; the controller is {}", status.channels[self.channel.index()].state.name());
         }
         if lost > 0 {
-            let _ = write!(text, "; {lost} frames or more were lost on the way to this computer");
+            let _ = write!(
+                text,
+                "; {lost} or more were lost on the way to this computer",
+                lost = counted(lost, "frame")
+            );
         }
         text
     }

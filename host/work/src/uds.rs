@@ -12,11 +12,11 @@ use cantap_protocols::active::transfer::TransferSettings;
 use cantap_protocols::diagnostics::{reason, uds_service};
 use cantap_protocols::iso_tp::{Endpoint, Pair};
 use cantap_protocols::{Event, EventKind, Party};
+use cantap_trace::counted;
 
 use crate::interrupt;
 use crate::report::Reporter;
 use crate::speaking::Speaking;
-use crate::terms::counted;
 
 /// The device's reply slots, from 0 on, that may be used for flow control: all of them.
 const FLOW_SLOTS: usize = 8;

@@ -1,6 +1,7 @@
 //! Memory of an ECU over UDS: download (34, 36, 37) and upload (35, 36, 37), ISO 14229-1.
 
 use anyhow::{anyhow, bail, ensure};
+use cantap_trace::counted;
 
 use crate::memory_image::Segment;
 use crate::uds::Client;
@@ -36,7 +37,8 @@ impl MemoryFormat {
             let (before, own) = all.split_at(all.len() - bytes);
             ensure!(
                 before.iter().all(|byte| *byte == 0),
-                "the {name} {number:X} needs more than {bytes} bytes: check --lengths"
+                "the {name} {number:X} needs more than {bytes}: check --lengths",
+                bytes = counted(bytes, "byte")
             );
             request.extend(own);
         }
@@ -54,7 +56,8 @@ fn block_bytes(answer: &[u8]) -> anyhow::Result<usize> {
         number.iter().fold(0_usize, |number, byte| number.saturating_mul(256).saturating_add((*byte).into()));
     ensure!(
         longest > BLOCK_HEAD_BYTES,
-        "the ECU takes blocks of {longest} bytes, which have no room for data"
+        "the ECU takes blocks of {longest}, which have no room for data",
+        longest = counted(longest, "byte")
     );
     Ok(longest.min(MOST_MESSAGE_BYTES) - BLOCK_HEAD_BYTES)
 }
@@ -70,7 +73,7 @@ pub fn download(client: &mut Client<'_>, segment: &Segment, format: MemoryFormat
     let mut counter = 0_u8;
     for (number, block) in segment.data.chunks(each).enumerate() {
         counter = counter.wrapping_add(1);
-        let taken = || format!("{} of {} bytes were taken", number * each, segment.data.len());
+        let taken = || format!("{} of {} taken", number * each, counted(segment.data.len(), "byte"));
         let answer = client
             .ask_and_show(&[&[0x36, counter], block].concat())
             .map_err(|error| anyhow!("{error}; {}", taken()))?;
@@ -100,18 +103,19 @@ pub fn upload(
     let mut counter = 0_u8;
     while data.len() < size {
         counter = counter.wrapping_add(1);
-        let answer = client
-            .ask_and_show(&[0x36, counter])
-            .map_err(|error| anyhow!("{error}; {} of {size} bytes had come", data.len()))?;
+        let answer = client.ask_and_show(&[0x36, counter]).map_err(|error| {
+            anyhow!("{error}; {} of {size} had come", data.len(), size = counted(size, "byte"))
+        })?;
         match &answer.data[..] {
             [_, number, block @ ..] if *number == counter && !block.is_empty() => data.extend(block),
             _ => bail!(
-                "the ECU answered another block than {counter:02X}, or without bytes; {} of {size} bytes had come",
-                data.len()
+                "the ECU answered another block than {counter:02X}, or without bytes; {} of {size} had come",
+                data.len(),
+                size = counted(size, "byte")
             ),
         }
     }
-    ensure!(data.len() == size, "the ECU sent {} bytes in place of {size}", data.len());
+    ensure!(data.len() == size, "the ECU sent {} in place of {size}", counted(data.len(), "byte"));
     client.ask_and_show(&[0x37])?;
     Ok(data)
 }

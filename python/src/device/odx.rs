@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::odx::{Descriptions, Ecu, Physical, Reading};
+use cantap_trace::counted;
 use cantap_work::odx::{OdxPath, load};
 use cantap_work::report::Reporter;
 use pyo3::prelude::*;
@@ -49,7 +50,7 @@ fn missing(reading: &Reading) -> Option<String> {
         return Some(if place.is_empty() { "its end".to_owned() } else { place.clone() });
     }
     let count = reading.undescribed.len();
-    (count > 0).then(|| format!("{count} bytes that the description does not have"))
+    (count > 0).then(|| format!("{} that the description does not have", counted(count, "byte")))
 }
 
 #[pymethods]

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use cantap_trace::counted;
+
 use super::super::model::Model;
 use super::super::order::Order;
 use super::entry::{SendEntry, parse_entry};
@@ -83,7 +85,7 @@ impl App {
             parse_entry(line, model).map_err(|reason| format!("{}, line {number}: {reason}", path.display()))
         };
         let entries = lines.map(entry).collect::<Result<Vec<_>, _>>()?;
-        self.message = format!("{} entries added; Space sends the selected one", entries.len());
+        self.message = format!("{} added; Space sends the selected one", counted(entries.len(), "entry"));
         self.send.extend(entries);
         Ok(())
     }

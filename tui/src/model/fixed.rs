@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use cantap_trace::fd::FD_MAX_BYTES;
+use cantap_trace::{DeviceNs, Moment};
 
 use cantap::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
 
@@ -24,6 +25,8 @@ pub struct Row {
     pub count: u64,
     /// When the last one ended.
     pub last_ns: i64,
+    /// The same by the device's clock.
+    last_device_ns: Option<DeviceNs>,
     /// The smoothed interval, in nanoseconds.
     pub period_ns: Option<f64>,
     /// The smoothed deviation of intervals from that, in nanoseconds.
@@ -56,6 +59,7 @@ impl Row {
             direction,
             count: 0,
             last_ns: record.time_ns,
+            last_device_ns: record.device_ns,
             period_ns: None,
             jitter_ns: 0.0,
             changed_ns: Box::new([i64::MIN; 2 * FD_MAX_BYTES]),
@@ -70,10 +74,12 @@ impl Row {
         }
     }
 
-    fn take(&mut self, time_ns: i64, frame: TraceFrame, direction: Direction) {
+    fn take(&mut self, at: Moment, frame: TraceFrame, direction: Direction) {
+        let time_ns = at.time_ns;
         // If the clock was set back, as where a file starts again, the interval is meaningless, too.
         if self.count > 0 && !self.gap && time_ns >= self.last_ns {
-            let interval = time_ns.saturating_sub(self.last_ns) as f64;
+            let last = Moment { time_ns: self.last_ns, device_ns: self.last_device_ns };
+            let interval = at.since_ns(last) as f64;
             match &mut self.period_ns {
                 Some(period) => {
                     let deviation = (interval - *period).abs();
@@ -94,6 +100,7 @@ impl Row {
         self.count += 1;
         self.gap = false;
         self.last_ns = time_ns;
+        self.last_device_ns = at.device_ns;
         self.frame = frame;
         self.direction = direction;
     }
@@ -116,7 +123,8 @@ impl Row {
     /// Its last frame as a record.
     pub fn last(&self) -> TraceRecord {
         let event = TraceEvent::Frame { frame: self.frame, direction: self.direction, late: false };
-        TraceRecord { time_ns: self.last_ns, device_ns: None, channel: self.channel, event }
+        let (time_ns, device_ns) = (self.last_ns, self.last_device_ns);
+        TraceRecord { time_ns, device_ns, channel: self.channel, event }
     }
 
     /// Suppresses changes of all bits that have changed so far.
@@ -174,7 +182,7 @@ impl FixedTable {
                         return;
                     }
                 };
-                self.rows[place].take(record.time_ns, frame, direction);
+                self.rows[place].take(record.moment(), frame, direction);
             }
             TraceEvent::Lost { .. } => {
                 let of_channel = self.rows.iter_mut().filter(|row| row.channel == record.channel);
@@ -326,6 +334,25 @@ mod tests {
         let row = &table.rows()[0];
         assert_eq!(row.period_ns, Some(10e6));
         assert!(row.jitter_ns < 1.0);
+    }
+
+    /// UTC is corrected while a trace is recorded; a crystal that is 400 ppm fast is not.
+    #[test]
+    fn the_period_is_the_devices() {
+        let mut table = FixedTable::default();
+        for n in 0..50_i64 {
+            let corrected = if n % 2 == 0 { 0 } else { 10_000 };
+            let event =
+                TraceEvent::Frame { frame: "123#".parse().unwrap(), direction: Direction::Rx, late: false };
+            table.take(&TraceRecord {
+                time_ns: n * 100_000_000 + corrected,
+                device_ns: DeviceNs::new(7 + n as u64 * 100_040_000),
+                channel: 1,
+                event,
+            });
+        }
+        let row = &table.rows()[0];
+        assert_eq!((row.period_ns, row.jitter_ns), (Some(100_040_000.0), 0.0));
     }
 
     #[test]

@@ -5,6 +5,7 @@ use std::collections::VecDeque;
 use cantap::{TraceEvent, TraceRecord};
 use cantap_signals::condition::Condition;
 use cantap_trace::filter::{Filter, passes};
+use cantap_trace::{Interval, Moment};
 
 use super::kept::Kept;
 
@@ -210,6 +211,16 @@ impl History {
         last.map(|last| low.min(last))
     }
 
+    /// How long it was from one time to another, listed records or not.
+    pub fn interval(&self, from_ns: i64, to_ns: i64) -> Interval {
+        let moment_at = |time_ns| {
+            let place = self.records.partition_point(|kept| kept.moment().time_ns < time_ns);
+            let earlier = self.records.range(..place).rev().map(Kept::moment);
+            Moment::at(time_ns, earlier, self.records.range(place..).map(Kept::moment))
+        };
+        moment_at(to_ns).interval_since(moment_at(from_ns))
+    }
+
     /// All records kept, listed or not, the oldest first.
     pub fn all(&self) -> impl Iterator<Item = TraceRecord> + use<'_> {
         self.records.iter().filter_map(|kept| self.whole(kept))
@@ -289,7 +300,7 @@ mod tests {
 
     #[test]
     fn fd_frames_make_room_by_their_size() {
-        let mut history = History::new(32 * 4000);
+        let mut history = History::new(size_of::<Kept>() * 4000);
         let event = |at: i64| {
             let frame = format!("123##1{}", "00".repeat(64)).parse().unwrap();
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };

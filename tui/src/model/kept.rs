@@ -1,11 +1,12 @@
-//! A record as the history keeps it: a third of the size of one with room for a CAN FD frame.
+//! A record as the history keeps it: less than half of the size of one with room for a CAN FD frame.
 
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap::{Direction, Frame, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::Moment;
 
 /// A record. What a classical device delivers is kept here; a CAN FD frame elsewhere, by number.
 pub struct Kept {
-    time_ns: i64,
+    at: Moment,
     channel: u8,
     what: What,
 }
@@ -37,7 +38,12 @@ impl Kept {
             TraceEvent::TransmitFailed { tag, reason } => What::TransmitFailed { tag, reason },
             TraceEvent::Disturbed { length_ns } => What::Disturbed { length_ns },
         };
-        Self { time_ns: record.time_ns, channel: record.channel, what }
+        Self { at: record.moment(), channel: record.channel, what }
+    }
+
+    /// When it happened.
+    pub const fn moment(&self) -> Moment {
+        self.at
     }
 
     /// Whether its event is kept elsewhere.
@@ -61,17 +67,19 @@ impl Kept {
             What::Disturbed { length_ns } => TraceEvent::Disturbed { length_ns: *length_ns },
             What::Fd(number) => elsewhere(*number)?,
         };
-        Some(TraceRecord { time_ns: self.time_ns, device_ns: None, channel: self.channel, event })
+        let Moment { time_ns, device_ns } = self.at;
+        Some(TraceRecord { time_ns, device_ns, channel: self.channel, event })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use cantap_trace::DeviceNs;
 
     #[test]
     fn every_record_comes_back_and_takes_little_room() {
-        assert_eq!(size_of::<Kept>(), 32);
+        assert_eq!(size_of::<Kept>(), 40);
         let frame = |text: &str| TraceEvent::Frame {
             frame: text.parse().unwrap(),
             direction: Direction::Tx,
@@ -86,9 +94,11 @@ mod tests {
             TraceEvent::GAP,
             TraceEvent::TransmitFailed { tag: 3, reason: TransmitFailure::Overtaken { periods: 9 } },
         ] {
-            let record = TraceRecord { time_ns: -5, device_ns: None, channel: 2, event };
-            let kept = Kept::new(&record, 7);
-            assert_eq!(kept.record(|number| (number == 7).then_some(event)), Some(record));
+            for device_ns in [None, DeviceNs::new(7)] {
+                let record = TraceRecord { time_ns: -5, device_ns, channel: 2, event };
+                let kept = Kept::new(&record, 7);
+                assert_eq!(kept.record(|number| (number == 7).then_some(event)), Some(record));
+            }
         }
     }
 }

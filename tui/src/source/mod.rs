@@ -24,6 +24,7 @@ use cantap_formats::{ChannelInfo, IndexFolder};
 use super::model::Model;
 use super::order::Order;
 use super::plan::Plan;
+use cantap_trace::counted;
 use cantap_work::cache;
 use cantap_work::obd::Asking;
 use cantap_work::recording::{Older, Recording};
@@ -141,7 +142,7 @@ impl Source<'_> {
     fn write_list(&self, path: &Path, text: &str) {
         let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
         self.notice(match written {
-            Ok(()) => format!("{} entries written to {}", text.lines().count(), path.display()),
+            Ok(()) => format!("{} written to {}", counted(text.lines().count(), "entry"), path.display()),
             Err(error) => format!("{} is not written: {error}", path.display()),
         });
     }

@@ -2,6 +2,7 @@
 
 use cantap::{TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
+use cantap_trace::DeviceNs;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::app::{App, View};
@@ -96,6 +97,25 @@ fn two_cursors_tell_times_values_and_what_is_between() {
     keys(&mut app, &mut model, &[KeyCode::Esc]);
     assert!(!screen_text(&mut app, &model, (100, 24)).unwrap().contains("Δt"));
     assert_eq!(app.graph.end_ns, None);
+}
+
+#[test]
+fn what_is_between_two_cursors_is_as_the_device_measured_it() {
+    let mut model = model(1_000_000);
+    // The device is 400 ppm fast.
+    let samples = (0..=100).map(|n| TraceRecord {
+        device_ns: DeviceNs::new(n as u64 * 100_040_000 + 5),
+        ..sample(n * 100 * MS, n as u8, 0)
+    });
+    model.take(&samples.collect::<Vec<_>>());
+    let (mut app, _orders) = app(View::Graph);
+    screen_text(&mut app, &model, (100, 24)).unwrap();
+    mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Left), 19);
+    let screen = mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Right), 55);
+    assert!(
+        screen.contains("A 12:00:01.055555  B 12:00:05.055555  Δt 4.001600 s by the device's clock"),
+        "{screen}"
+    );
 }
 
 #[test]

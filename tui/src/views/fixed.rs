@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::fmt::Write as _;
 
 use cantap_signals::MessageRef;
+use cantap_trace::counted;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -111,11 +112,11 @@ fn heading(app: &mut App, seen: &Seen, screen: u16, hidden: usize) -> Line<'stat
         notes.push(format!("{hidden} hidden"));
     }
     if seen.table.unlisted > 0 {
-        notes.push(format!("{} frames of further IDs", seen.table.unlisted));
+        notes.push(format!("{} of further IDs", counted(seen.table.unlisted, "frame")));
     }
     let muted = seen.table.notched_bits();
     if muted > 0 {
-        notes.push(format!("{muted} bits muted"));
+        notes.push(format!("{muted} muted", muted = counted(muted, "bit")));
     }
     if notes.is_empty() {
         return Line::from(text.trim_end().to_owned());

@@ -56,7 +56,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         View::Trace => trace::draw(frame, body, app, model),
         View::Fixed => fixed::draw(frame, body, app, model, seen),
         View::Signals => signals::draw(frame, body, app, model, seen),
-        View::Graph => graph::draw(frame, body, app, seen),
+        View::Graph => graph::draw(frame, body, app, &model.history, seen),
         View::Statistics => statistics::draw(frame, body, app, model, seen),
         View::Send => send::draw(frame, body, app, seen),
         View::Record => record::draw(frame, body, app, model),

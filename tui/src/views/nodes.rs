@@ -1,5 +1,6 @@
 //! What the bus says: its nodes with their states and trouble codes, transfers in progress, and the latest events.
 
+use cantap_trace::counted;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::Line;
@@ -19,7 +20,11 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     let mut lines = Vec::new();
     let heading = |text: String| Line::from(text).style(Theme::heading());
     let nodes = talked.overview.nodes().count();
-    lines.push(heading(format!("Nodes {nodes}, {} events, {} with a fault", talked.events, talked.faults)));
+    lines.push(heading(format!(
+        "Nodes {nodes}, {}, {} with a fault",
+        counted(talked.events, "event"),
+        talked.faults
+    )));
     if nodes == 0 {
         lines.push(Line::from(
             "Nobody was understood so far; the first three seconds of a bus tell what it speaks.",
@@ -34,8 +39,13 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     for transfer in &talked.under_way {
         let whole = transfer.length.map_or_else(|| "?".to_owned(), |length| length.to_string());
         lines.push(Line::from(format!(
-            "{} {:<9} {} > {}  {} of {whole} bytes",
-            transfer.channel, transfer.protocol, transfer.from, transfer.to, transfer.received
+            "{} {:<9} {} > {}  {} of {whole}",
+            transfer.channel,
+            transfer.protocol,
+            transfer.from,
+            transfer.to,
+            transfer.received,
+            whole = counted(whole, "byte")
         )));
     }
     app.page_rows = rows;

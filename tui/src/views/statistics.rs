@@ -4,6 +4,7 @@ use cantap::Channel;
 use cantap::device::{ClockSource, channel_number};
 use cantap::wire::record::{BusErrorKind, LossStage};
 use cantap_analysis::stats::{ChannelStatistics, is_of_a_part};
+use cantap_trace::counted;
 use cantap_work::bus_hints::{BusHint, HintPlace};
 use cantap_work::channels::place_of;
 use ratatui::Frame;
@@ -46,17 +47,18 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     }
     let (used, most) = model.history.memory();
     lines.push(Line::from(format!(
-        "Memory    {} of {} records, {} of {}",
+        "Memory    {} of {}, {} of {}",
         model.history.len(),
-        seen.taken,
+        counted(seen.taken, "record"),
         bytes(used as u64),
         bytes(most as u64)
     )));
     let (values, used, most) = seen.signals.graph_memory();
     lines.push(Line::from(format!(
-        "Graph     {values} values, {} of {}",
+        "Graph     {values}, {} of {}",
         bytes(used as u64),
-        bytes(most as u64)
+        bytes(most as u64),
+        values = counted(values, "value")
     )));
     app.page_rows = usize::from(area.height);
     // Scrolled with the arrows if the screen is small.
@@ -117,7 +119,7 @@ fn channel_lines(
     let uncounted = match losses.uncounted {
         0 => String::new(),
         1 => "; an unknown number".to_owned(),
-        uncounted => format!("; an unknown number at {uncounted} places"),
+        uncounted => format!("; an unknown number at {uncounted}", uncounted = counted(uncounted, "place")),
     };
     lines.push(Line::styled(
         format!("Lost      {total:>10}{least}   {}{uncounted}", stages.join(", ")),

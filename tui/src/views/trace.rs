@@ -156,11 +156,10 @@ fn line(
     model: &Model,
 ) -> Line<'static> {
     let theme = app.theme;
-    let since = |ns: i64| seconds(record.time_ns.saturating_sub(ns));
     let time = match app.time_mode {
         TimeMode::Absolute => clock(record.time_ns, 6),
-        TimeMode::Relative => since(model.first_ns.unwrap_or(0)),
-        TimeMode::Delta => since(before.map_or(record.time_ns, |before| before.time_ns)),
+        TimeMode::Relative => seconds(record.time_ns.saturating_sub(model.first_ns.unwrap_or(0))),
+        TimeMode::Delta => seconds(before.map_or(0, |before| record.moment().since_ns(before.moment()))),
     };
     let start = format!("{}{} ", columns.time_text(&time), record.channel);
     let TraceEvent::Frame { frame, direction, late } = record.event else {

@@ -7,6 +7,7 @@ use cantap_protocols::{Event, EventKind, Options, Party, ReadItem, Reader};
 use cantap_signals::Decoder;
 use serde::Serialize;
 
+use crate::interval::{self, IntervalAnswer};
 use crate::trace::Content;
 
 /// The records by which a channel's protocols are found: those of so many nanoseconds from the beginning.
@@ -23,6 +24,7 @@ const TEXT: usize = 400;
 pub struct ProtocolEvent {
     time: f64,
     end: f64,
+    took: IntervalAnswer,
     channel: u8,
     protocol: &'static str,
     kind: &'static str,
@@ -78,6 +80,7 @@ pub fn found(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, lim
             found.events.push(ProtocolEvent {
                 time: content.seconds(event.start_ns),
                 end: content.seconds(event.time_ns),
+                took: interval::between(event.start_ns, event.time_ns, &content.store).into(),
                 channel: event.channel,
                 protocol: event.protocol.name(),
                 kind: event.kind.name(),

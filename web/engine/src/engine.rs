@@ -14,6 +14,7 @@ use crate::export;
 use crate::findings::{self, Finding};
 use crate::identifiers;
 use crate::index::{Index, Place, identifier};
+use crate::interval::{self, IntervalAnswer};
 use crate::load::{self, ChannelBits};
 use crate::message::{self, Floats, Received, Sections};
 use crate::own_database::SignalEdit;
@@ -310,10 +311,13 @@ impl Engine {
             }
             Request::Rows { view, from, count } => {
                 let rows = views.rows(view, store)?;
-                let records =
-                    (from..from.saturating_add(count.min(MOST_ROWS))).map_while(|row| rows.record(row));
-                let row = |index: usize| Some(Row::of(index, &store.record(index)?, content, databases));
-                json(records.filter_map(row).collect::<Vec<_>>())
+                let places = from..from.saturating_add(count.min(MOST_ROWS));
+                let row = |place: usize| {
+                    let index = rows.record(place)?;
+                    let above = place.checked_sub(1).and_then(|above| rows.record(above));
+                    Some(Row::of(index, above, &store.record(index)?, content, databases))
+                };
+                json(places.map_while(row).collect::<Vec<_>>())
             }
             Request::RowAt { view, time } => {
                 let record = store.row_at(content.end_of_ns(time));
@@ -350,6 +354,10 @@ impl Engine {
                     at_least: gap.at_least,
                 };
                 json(gaps.map(gap).collect::<Vec<_>>())
+            }
+            Request::Interval { from, to } => {
+                let (from, to) = (content.end_of_ns(Some(from)), content.end_of_ns(Some(to)));
+                json(IntervalAnswer::from(interval::between(from, to, store)))
             }
             Request::Periods { channel, id, extended } => {
                 let place = Place { channel, id: identifier(id, extended)? };

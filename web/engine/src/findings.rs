@@ -3,7 +3,9 @@
 use std::collections::BTreeSet;
 
 use cantap_analysis::stats::{Statistics, WorkLoad};
+use cantap_protocols::{EventKind, Party};
 use cantap_signals::Decoder;
+use cantap_trace::counted;
 use cantap_trace::{Id, Seconds, TraceEvent};
 use serde::Serialize;
 
@@ -92,10 +94,6 @@ pub fn all(content: &Content, index: &Index, decoder: &Decoder) -> Vec<Finding> 
     found
 }
 
-fn plural(count: u64, noun: &str) -> String {
-    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
-}
-
 fn losses(content: &Content, found: &mut Vec<Finding>) {
     let gaps: Vec<_> = content.gaps.all(content.end_ns()).collect();
     for gap in gaps.iter().take(MOST_OF_A_KIND) {
@@ -109,8 +107,8 @@ fn losses(content: &Content, found: &mut Vec<Finding>) {
         } else {
             let count = match (gap.count, gap.at_least) {
                 (0, true) => "an unknown number of frames".to_owned(),
-                (count, true) => format!("at least {}", plural(count, "frame")),
-                (count, false) => plural(count, "frame"),
+                (count, true) => format!("at least {}", counted(count, "frame")),
+                (count, false) => counted(count, "frame"),
             };
             Finding::new(
                 Severity::Error,
@@ -122,7 +120,7 @@ fn losses(content: &Content, found: &mut Vec<Finding>) {
     if let Some(more) = gaps.len().checked_sub(MOST_OF_A_KIND).filter(|more| *more > 0) {
         found.push(Finding::new(
             Severity::Error,
-            format!("{more} more stretches in which frames are missing"),
+            format!("{more} in which frames are missing", more = counted(more, "more stretch")),
         ));
     }
 }
@@ -131,33 +129,34 @@ fn unread(content: &Content, found: &mut Vec<Finding>) {
     let unread = content.unread();
     let total: u64 = unread.iter().map(|(_, count)| count).sum();
     if let Some((first, _)) = unread.first() {
-        let text =
-            format!("{} of the file were not read as frames; the first: {first}", plural(total, "place"));
+        let text = format!("{} of the file not read as frames; the first: {first}", counted(total, "place"));
         found.push(Finding::new(Severity::Warning, text));
     }
 }
 
 fn channels(content: &Content, found: &mut Vec<Finding>) {
     let statistics: &Statistics = &content.statistics;
-    for channel in statistics.channels() {
+    let mut channels: Vec<_> = statistics.channels().iter().collect();
+    channels.sort_by_key(|channel| channel.number);
+    for channel in channels {
         let number = channel.number;
         let on =
             |severity, text: String| Finding::new(severity, format!("Channel {number}: {text}")).on(number);
         if channel.errors.total() > 0 {
             let first = first_error(content, number);
-            let finding = on(Severity::Error, plural(channel.errors.total(), "bus error"));
+            let finding = on(Severity::Error, counted(channel.errors.total(), "bus error"));
             found.push(first.map_or(finding.clone(), |time| finding.at(time)));
         }
         if channel.transmit_failures > 0 {
             found.push(on(
                 Severity::Warning,
-                format!("{} not sent", plural(channel.transmit_failures, "frame")),
+                format!("{} not sent", counted(channel.transmit_failures, "frame")),
             ));
         }
         if channel.out_of_order > 0 {
             let text = format!(
                 "{} with a time before that of the one before",
-                plural(channel.out_of_order, "record")
+                counted(channel.out_of_order, "record")
             );
             found.push(on(Severity::Warning, text));
         }
@@ -170,7 +169,9 @@ fn channels(content: &Content, found: &mut Vec<Finding>) {
             found.push(on(Severity::Warning, text).at(content.seconds(peak.start_ns)));
         }
         if let Some(mean) = summary {
-            found.push(on(Severity::Info, format!("mean bus load {mean:.1} %")));
+            // What is there is not shown as nothing.
+            let mean = if mean > 0.0 && mean < 0.05 { "< 0.1".to_owned() } else { format!("{mean:.1}") };
+            found.push(on(Severity::Info, format!("mean bus load {mean} %")));
         } else if channel.frames > 1 {
             found.push(on(
                 Severity::Info,
@@ -178,7 +179,7 @@ fn channels(content: &Content, found: &mut Vec<Finding>) {
             ));
         }
         if channel.late > 0 {
-            let text = format!("{} whose time is an upper bound only", plural(channel.late, "frame"));
+            let text = format!("{} whose time is an upper bound only", counted(channel.late, "frame"));
             found.push(on(Severity::Info, text));
         }
     }
@@ -209,7 +210,7 @@ fn missing_periods(content: &Content, index: &Index, decoder: &Decoder, found: &
         if intervals.len() < FEWEST_PERIODS {
             continue;
         }
-        let mut sorted: Vec<i64> = intervals.iter().map(|(_, interval)| *interval).collect();
+        let mut sorted: Vec<i64> = intervals.iter().map(|intact| intact.interval.ns).collect();
         sorted.sort_unstable();
         let (median, high) = (sorted[sorted.len() / 2], sorted[sorted.len() * 9 / 10]);
         // Only what is regular can be missing.
@@ -217,26 +218,27 @@ fn missing_periods(content: &Content, index: &Index, decoder: &Decoder, found: &
             continue;
         }
         let limit = median.saturating_mul(MISSING_PERIODS).max(SHORTEST_PAUSE_NS);
-        let pauses = || intervals.iter().filter(|(_, interval)| *interval > limit);
-        let Some((end, longest)) = pauses().max_by_key(|(_, interval)| *interval).copied() else { continue };
+        let pauses = || intervals.iter().filter(|intact| intact.interval.ns > limit);
+        let Some(pause) = pauses().max_by_key(|intact| intact.interval.ns) else { continue };
+        let longest = pause.interval.ns;
         let name = name(place, decoder);
         let more = match pauses().count() - 1 {
             0 => String::new(),
-            more => format!(", and {more} times more for a shorter time"),
+            more => format!(", and {more} more for a shorter time", more = counted(more, "time")),
         };
         let text = format!(
             "{name} did not come for {:.3} s; usually it comes every {:.1} ms{more}",
             longest as f64 / 1e9,
             median as f64 / 1e6
         );
-        let begin = content.seconds(end.saturating_sub(longest));
+        let begin = content.seconds(pause.from_ns);
         let finding = Finding::new(Severity::Warning, text).on(place.channel).of(place.id).at(begin);
         all.push((longest / median, finding));
     }
     if index.unlisted() > 0 {
         let text = format!(
             "{} whose identifiers are too many to be listed one by one",
-            plural(index.unlisted(), "frame")
+            counted(index.unlisted(), "frame")
         );
         found.push(Finding::new(Severity::Warning, text));
     }
@@ -246,7 +248,7 @@ fn missing_periods(content: &Content, index: &Index, decoder: &Decoder, found: &
     if more > 0 {
         found.push(Finding::new(
             Severity::Warning,
-            format!("{more} more identifiers did not come for some time"),
+            format!("{more} did not come for some time", more = counted(more, "more identifier")),
         ));
     }
 }
@@ -272,8 +274,11 @@ fn trouble_codes(content: &Content, decoder: &Decoder, found: &mut Vec<Finding>)
         if codes.is_empty() || listed.len() > MOST_OF_A_KIND {
             return;
         }
+        // Whoever asks has none of them: they are of the one that answers.
+        let is_exchange = matches!(event.kind, EventKind::Exchange | EventKind::Request);
+        let owner = if is_exchange && event.to != Party::Unknown { event.to } else { event.from };
         let mut from = String::new();
-        event.from.push_to(&mut from);
+        owner.push_to(&mut from);
         let codes = cantap_trace::clean::line(codes).into_owned();
         if known.insert((event.channel, from.clone(), codes.clone())) {
             let text =

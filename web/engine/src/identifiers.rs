@@ -1,6 +1,6 @@
 //! One identifier: its last frame at a time, its bits, its periods.
 
-use cantap_trace::TraceEvent;
+use cantap_trace::{Interval, TraceEvent};
 use serde::Serialize;
 
 use crate::databases::{Databases, SignalInfo, Value};
@@ -35,10 +35,12 @@ pub struct IdRow {
 }
 
 #[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
 struct PeriodOf {
     median: f64,
     min: f64,
     max: f64,
+    by_device: bool,
 }
 
 /// All identifiers that came up to a time.
@@ -77,13 +79,13 @@ pub fn rows_at(
 }
 
 fn period(recent: &[u32], store: &Store) -> Option<PeriodOf> {
-    let time = |row: &u32| store.time_ns(*row as usize);
-    let mut intervals: Vec<i64> =
-        recent.windows(2).map(|pair| time(&pair[1]).saturating_sub(time(&pair[0]))).collect();
-    intervals.sort_unstable();
-    let seconds = |ns: i64| ns as f64 / 1e9;
-    let (min, max) = (*intervals.first()?, *intervals.last()?);
-    Some(PeriodOf { median: seconds(intervals[intervals.len() / 2]), min: seconds(min), max: seconds(max) })
+    let between = |pair: &[u32]| store.interval(pair[0] as usize, pair[1] as usize);
+    let mut intervals: Vec<Interval> = recent.windows(2).map(between).collect();
+    let by_device = intervals.iter().all(|interval| interval.by_device);
+    intervals.sort_unstable_by_key(|interval| interval.ns);
+    let seconds = |interval: &Interval| interval.ns as f64 / 1e9;
+    let (min, max) = (seconds(intervals.first()?), seconds(intervals.last()?));
+    Some(PeriodOf { median: seconds(&intervals[intervals.len() / 2]), min, max, by_device })
 }
 
 /// A row's data bytes.
@@ -186,6 +188,7 @@ fn count(mut byte: u8, counts: &mut [u32]) {
 
 /// The answer to `periods` in `api.ts`.
 #[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
 pub struct Periods {
     edges: Floats,
     counts: Integers,
@@ -193,6 +196,7 @@ pub struct Periods {
     max: f64,
     mean: f64,
     deviation: f64,
+    by_device: bool,
 }
 
 /// A histogram of an identifier's periods, without those in which frames of the channel were lost.
@@ -203,11 +207,12 @@ pub fn periods(place: Place, content: &Content, index: &Index, sections: &mut Se
         &content.store,
         &content.gaps.all(content.end_ns()).collect::<Vec<_>>(),
     );
-    let mut seconds: Vec<f64> = intervals.iter().map(|(_, ns)| *ns as f64 / 1e9).collect();
+    let by_device = intervals.iter().all(|intact| intact.interval.by_device);
+    let mut seconds: Vec<f64> = intervals.iter().map(|intact| intact.interval.ns as f64 / 1e9).collect();
     seconds.sort_by(f64::total_cmp);
     let (Some(min), Some(max)) = (seconds.first().copied(), seconds.last().copied()) else {
         let (edges, counts) = (sections.floats(&[]), sections.integers(&[]));
-        return Periods { edges, counts, min: 0.0, max: 0.0, mean: 0.0, deviation: 0.0 };
+        return Periods { edges, counts, min: 0.0, max: 0.0, mean: 0.0, deviation: 0.0, by_device: false };
     };
     let count = seconds.len() as f64;
     let mean = seconds.iter().sum::<f64>() / count;
@@ -229,11 +234,20 @@ pub fn periods(place: Place, content: &Content, index: &Index, sections: &mut Se
         let bin = edges.partition_point(|edge| edge <= one).saturating_sub(1).min(counts.len() - 1);
         counts[bin] += 1;
     }
-    Periods { edges: sections.floats(&edges), counts: sections.integers(&counts), min, max, mean, deviation }
+    let (edges, counts) = (sections.floats(&edges), sections.integers(&counts));
+    Periods { edges, counts, min, max, mean, deviation, by_device }
 }
 
-/// The intervals between an identifier's frames, each with the time of its end, without those with a gap of the channel in them.
-pub fn intact_intervals(place: Place, rows: &[u32], store: &Store, gaps: &[Gap]) -> Vec<(i64, i64)> {
+/// From one frame of an identifier to the next.
+pub struct Intact {
+    /// When the first one was.
+    pub from_ns: i64,
+    /// How long it took.
+    pub interval: Interval,
+}
+
+/// The intervals between an identifier's frames, without those with a gap of the channel in them.
+pub fn intact_intervals(place: Place, rows: &[u32], store: &Store, gaps: &[Gap]) -> Vec<Intact> {
     let mut gaps: Vec<_> = gaps.iter().filter(|gap| gap.channel == place.channel).collect();
     gaps.sort_by_key(|gap| gap.from_ns);
     let mut gaps = gaps.into_iter().peekable();
@@ -244,7 +258,8 @@ pub fn intact_intervals(place: Place, rows: &[u32], store: &Store, gaps: &[Gap])
         // A gap ends with a frame, perhaps this one, and begins with one.
         while gaps.next_if(|gap| gap.to_ns <= from).is_some() {}
         if gaps.peek().is_none_or(|gap| gap.from_ns >= to) {
-            intervals.push((to, to.saturating_sub(from)));
+            let interval = store.interval(pair[0] as usize, pair[1] as usize);
+            intervals.push(Intact { from_ns: from, interval });
         }
     }
     intervals

@@ -28,6 +28,7 @@ pub enum Request {
     RawSeries(Box<RawSeries>),
     Load { channel: u8, from: Option<f64>, to: Option<f64>, columns: usize },
     Gaps { from: Option<f64>, to: Option<f64> },
+    Interval { from: f64, to: f64 },
     Periods { channel: u8, id: u32, extended: bool },
     Conversations { from: Option<f64>, to: Option<f64>, limit: usize },
     Findings {},

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use crate::databases::Databases;
 use crate::index::Place;
+use crate::interval::IntervalAnswer;
 use crate::trace::Content;
 
 /// `Row` in `api.ts`.
@@ -14,6 +15,8 @@ use crate::trace::Content;
 pub struct Row {
     index: usize,
     time: f64,
+    /// Since the row above.
+    above: Option<IntervalAnswer>,
     late: bool,
     channel: Option<u8>,
     kind: &'static str,
@@ -27,11 +30,18 @@ pub struct Row {
 }
 
 impl Row {
-    /// The row of a record.
-    pub fn of(index: usize, record: &TraceRecord, content: &Content, databases: &Databases) -> Self {
+    /// The row of a record, below that of the record `above`.
+    pub fn of(
+        index: usize,
+        above: Option<usize>,
+        record: &TraceRecord,
+        content: &Content,
+        databases: &Databases,
+    ) -> Self {
         let mut row = Self {
             index: content.forgotten() + index,
             time: content.seconds(record.time_ns),
+            above: above.map(|above| content.store.interval(above, index).into()),
             late: false,
             channel: Some(record.channel),
             kind: kind(&record.event),

@@ -1,6 +1,11 @@
-//! The records of a trace in columns: 22 bytes for a frame of up to eight data bytes, where a [`TraceRecord`] has 96.
+//! The records of a trace in columns: 22 bytes for a frame of up to eight data bytes, 26 if the device's time is known, where a
+//! [`TraceRecord`] has 96.
 
-use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord, fd::FD_LENGTHS};
+use cantap_trace::{
+    Direction, FdFrame, Frame, Id, Interval, Moment, TraceEvent, TraceFrame, TraceRecord, fd::FD_LENGTHS,
+};
+
+use crate::device_times::DeviceTimes;
 
 /// Rows of a block: blocks are filled one after another, so that nothing is copied when the trace grows.
 pub const BLOCK_ROWS: usize = 1 << 16;
@@ -30,11 +35,13 @@ pub struct Store {
     rows: usize,
     latest_ns: i64,
     is_unordered: bool,
+    has_device_times: bool,
 }
 
 #[derive(Default)]
 struct Block {
     times: Vec<i64>,
+    device_times: DeviceTimes,
     ids: Vec<u32>,
     channels: Vec<u8>,
     kinds: Vec<u8>,
@@ -64,12 +71,18 @@ impl Store {
         self.is_unordered
     }
 
+    /// Whether a record has the device's own time.
+    pub const fn has_device_times(&self) -> bool {
+        self.has_device_times
+    }
+
     /// Adds a record.
     pub fn push(&mut self, record: &TraceRecord) {
         if self.rows.is_multiple_of(BLOCK_ROWS) {
             self.blocks.push(Block::new());
         }
         self.is_unordered |= self.rows > 0 && record.time_ns < self.latest_ns;
+        self.has_device_times |= record.device_ns.is_some();
         self.latest_ns = record.time_ns;
         self.rows += 1;
         if let Some(block) = self.blocks.last_mut() {
@@ -94,6 +107,21 @@ impl Store {
     #[inline]
     pub fn time_ns(&self, row: usize) -> i64 {
         self.block(row).and_then(|(block, at)| block.times.get(at).copied()).unwrap_or(self.latest_ns)
+    }
+
+    /// When a row's record happened, by both clocks; of rows that there are not, as [`Self::time_ns`].
+    #[inline]
+    pub fn moment(&self, row: usize) -> Moment {
+        match self.block(row) {
+            Some((block, at)) if at < block.times.len() => block.moment(at),
+            _ => Moment { time_ns: self.latest_ns, device_ns: None },
+        }
+    }
+
+    /// How long after one row's record another one's was.
+    #[inline]
+    pub fn interval(&self, from: usize, to: usize) -> Interval {
+        self.moment(to).interval_since(self.moment(from))
     }
 
     /// The first row at or after a time, if the records are in order.
@@ -161,6 +189,7 @@ impl Block {
     }
 
     fn push(&mut self, record: &TraceRecord) {
+        self.device_times.push(self.times.len(), record.moment());
         self.times.push(record.time_ns);
         self.channels.push(record.channel);
         let (id, kind, data) = match record.event {
@@ -198,13 +227,19 @@ impl Block {
         (packed, kind << 4 | frame.dlc() & 15, data)
     }
 
+    fn moment(&self, at: usize) -> Moment {
+        let time_ns = self.times[at];
+        Moment { time_ns, device_ns: self.device_times.get(at, time_ns) }
+    }
+
     fn record(&self, at: usize) -> Option<TraceRecord> {
         let (time_ns, channel) = (*self.times.get(at)?, self.channels[at]);
+        let device_ns = self.device_times.get(at, time_ns);
         let (packed, kind, data) = (self.ids[at], self.kinds[at], self.data[at]);
         if kind >> 4 == EVENT {
             return Some(TraceRecord {
                 time_ns,
-                device_ns: None,
+                device_ns,
                 channel,
                 event: *self.events.get(data as usize)?,
             });
@@ -227,25 +262,26 @@ impl Block {
         };
         let direction = if packed & SENT == 0 { Direction::Rx } else { Direction::Tx };
         let event = TraceEvent::Frame { frame, direction, late: packed & LATE != 0 };
-        Some(TraceRecord { time_ns, device_ns: None, channel, event })
+        Some(TraceRecord { time_ns, device_ns, channel, event })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_trace::testing::record_or_fd;
+    use cantap_trace::testing::{record_or_fd, with_device_time};
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn a_record_comes_out_as_it_went_in(records in prop::collection::vec(record_or_fd(3), 1..60)) {
+        fn a_record_comes_out_as_it_went_in(records in prop::collection::vec(prop_oneof![record_or_fd(3), with_device_time(record_or_fd(3))], 1..60)) {
             let mut store = Store::default();
             for record in &records {
                 store.push(record);
             }
             for (row, record) in records.iter().enumerate() {
                 prop_assert_eq!(store.record(row), Some(*record));
+                prop_assert_eq!(store.moment(row), record.moment());
                 let short = record.frame().filter(|frame| !frame.is_remote() && frame.data_len() <= 8);
                 let found = store.short_data(row);
                 prop_assert_eq!(found.map(|(bytes, len)| bytes[..len].to_vec()), short.map(|frame| frame.data().to_vec()));

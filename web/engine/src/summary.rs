@@ -26,6 +26,7 @@ pub struct Summary {
     issues: Vec<Issue>,
     growing: bool,
     progress: Option<f64>,
+    device_times: bool,
 }
 
 #[derive(Serialize)]
@@ -90,6 +91,7 @@ impl Summary {
             issues: content.unread().into_iter().map(|(text, count)| Issue { text, count }).collect(),
             growing: progress.growing,
             progress: progress.part,
+            device_times: content.store.has_device_times(),
         }
     }
 }

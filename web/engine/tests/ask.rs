@@ -1,6 +1,6 @@
 //! Requests and answers as the page has them, over real bytes.
 
-use cantap_trace::{Direction, TraceEvent, TraceRecord, packed};
+use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord, packed};
 use cantap_web_engine::{Engine, message};
 use serde_json::{Value, json};
 
@@ -402,6 +402,60 @@ fn live(from: i64, count: i64) -> Vec<u8> {
         bytes.extend(packed);
     }
     bytes
+}
+
+/// A request and its answer every 10 ms, by a device that is 400 ppm fast and whose UTC is corrected at every second record.
+#[test]
+fn intervals_are_the_devices_where_it_stamped_both_ends() {
+    let record = |n: i64| {
+        let text = if n % 2 == 0 { "7E0#0322F19000000000" } else { "7E8#0462F19041000000" };
+        let event = TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false };
+        TraceRecord {
+            time_ns: 1_700_000_000_000_000_000 + n * 10_000_000 + n / 2 % 2 * 900,
+            device_ns: DeviceNs::new(5_000_000_000 + n as u64 * 10_004_000),
+            channel: 1,
+            event,
+        }
+    };
+    let records: Vec<_> = (0..100).map(record).collect();
+    let mut packed = Vec::new();
+    packed::write(&records, &mut packed);
+    let bytes = [&(packed.len() as u32).to_le_bytes()[..], &packed].concat();
+    let mut page = Page::default();
+    let open = json!({ "name": "board", "more": true, "size": null });
+    page.try_ask("open", open, Some(&[])).unwrap();
+    let summary = page.try_ask("append", json!({ "more": true }), Some(&bytes)).unwrap().0;
+    assert_eq!(summary["deviceTimes"], true);
+    let is = |interval: &Value, seconds: f64| {
+        let found = interval["seconds"].as_f64().unwrap();
+        assert!((found - seconds).abs() < 1e-12 && interval["byDevice"] == true, "{interval} {seconds}");
+    };
+    let rows = page.ask("rows", json!({ "view": 0, "from": 0, "count": 3 }));
+    assert_eq!(rows[0]["above"], Value::Null);
+    is(&rows[2]["above"], 0.010_004);
+    let view = page.ask("filter", json!({ "filter": "7E8" }));
+    let rows = page.ask("rows", json!({ "view": view["view"], "from": 1, "count": 1 }));
+    is(&rows[0]["above"], 0.020_008);
+    let ids = page.ask("ids", json!({ "at": null }));
+    let period = &ids[0]["period"];
+    assert_eq!(
+        (&period["byDevice"], &period["min"], &period["max"]),
+        (&json!(true), &period["median"], &period["median"])
+    );
+    assert!((period["min"].as_f64().unwrap() - 0.020_008).abs() < 1e-12);
+    let periods = page.ask("periods", json!({ "channel": 1, "id": 0x7E0, "extended": false }));
+    assert_eq!(periods["byDevice"], true);
+    assert!(periods["deviation"].as_f64().unwrap() < 1e-12, "{periods}");
+    // The cursors are not at records.
+    let between = page.ask("interval", json!({ "from": 0.105, "to": 0.905 }));
+    assert!((between["seconds"].as_f64().unwrap() - 0.8 * 1.0004).abs() < 1e-6, "{between}");
+    let found = page.ask("conversations", json!({ "from": null, "to": null, "limit": 5 }));
+    is(&found["events"][0]["took"], 0.010_004);
+    // Another trace has only UTC.
+    let summary = page.open("drive.log", log().as_bytes()).unwrap();
+    assert_eq!(summary["deviceTimes"], false);
+    let between = page.ask("interval", json!({ "from": 0.01, "to": 0.03 }));
+    assert_eq!(between, json!({ "seconds": 0.02, "byDevice": false }));
 }
 
 #[test]

@@ -46,6 +46,14 @@ export interface Summary {
   growing: boolean;
   /** 0 to 1 of the file's bytes read so far; null for a live source. */
   progress: number | null;
+  /** Whether records have the time of the device that stamped them, beside UTC. */
+  deviceTimes: boolean;
+}
+
+/** How long something took. Without `byDevice` it is a difference of UTC, which is corrected while a trace is recorded. */
+export interface Interval {
+  seconds: number;
+  byDevice: boolean;
 }
 
 export type RowKind = 'data' | 'remote' | 'fd' | 'error' | 'state' | 'lost' | 'other';
@@ -55,6 +63,8 @@ export interface Row {
   /** Number of the record in the whole trace, from 0. */
   index: number;
   time: number;
+  /** Since the row above in the view; null for the first. */
+  above: Interval | null;
   /** The stamp is an upper bound, not exact. */
   late: boolean;
   channel: number | null;
@@ -79,7 +89,7 @@ export interface IdRow {
   message: string | null;
   count: number;
   /** Period in seconds, of the last 512 frames: median, smallest, largest. Null with fewer than two frames. */
-  period: { median: number; min: number; max: number } | null;
+  period: { median: number; min: number; max: number; byDevice: boolean } | null;
   lastTime: number;
   lastData: string;
   /** For each bit of the data (byte 0 bit 7 first), the time it last changed; NaN if not within the last 512 frames. */
@@ -188,6 +198,7 @@ export interface Finding {
 export interface ProtocolEvent {
   time: number;
   end: number;
+  took: Interval;
   channel: number;
   protocol: string;
   kind: string;
@@ -288,13 +299,15 @@ export interface Requests {
   /** 0 to 1 per column; NaN where it cannot be known, such as without a bit rate. */
   load: { in: { channel: number; from: number; to: number; columns: number }; out: { time: Float64Array; load: Float64Array } };
   gaps: { in: { from: number; to: number }; out: Gap[] };
+  /** From one time to another, which may be between records. */
+  interval: { in: { from: number; to: number }; out: Interval };
   /**
    * Periods of one identifier: a histogram, `counts[i]` between `edges[i]` and `edges[i + 1]` seconds. Periods in which frames of the channel
    * were lost are left out. Empty, with zeros, if there is none.
    */
   periods: {
     in: { channel: number; id: number; extended: boolean };
-    out: { edges: Float64Array; counts: Uint32Array; min: number; max: number; mean: number; deviation: number };
+    out: { edges: Float64Array; counts: Uint32Array; min: number; max: number; mean: number; deviation: number; byDevice: boolean };
   };
   conversations: { in: { from: number; to: number; limit: number }; out: { events: ProtocolEvent[]; total: number } };
   findings: { in: Record<string, never>; out: Finding[] };

@@ -3,7 +3,7 @@
 import type { App } from './model/app';
 import { openFiles } from './model/open-files';
 import { blobOfBase64, gunzip, save } from './model/files';
-import { bytes, count, duration, idText, missing, parseTime, percent } from './model/format';
+import { bytes, duration, idText, missing, parseTime, percent, plural } from './model/format';
 import { parseProfile } from './model/storage';
 import { Commands, type Command, keyLabel } from './ui/commands';
 import { openDialog } from './ui/dialog';
@@ -329,7 +329,7 @@ export class Shell {
     this.#name.title = summary.name;
     const file = this.app.traceFile;
     const reading = summary.growing && summary.progress !== null;
-    setText(this.#status, `${count(summary.frames)} frames in ${duration(summary.duration)}${file ? `, ${summary.format}, ${bytes(file.size)}` : ''}${reading ? `, read ${percent(summary.progress)}` : ''}`);
+    setText(this.#status, `${plural(summary.frames, 'frame')} in ${duration(summary.duration)}${file ? `, ${summary.format}, ${bytes(file.size)}` : ''}${reading ? `, read ${percent(summary.progress)}` : ''}`);
     this.#progress.hidden = !reading;
     this.#progress.value = summary.progress ?? 0;
     const lost = summary.losses.reduce((sum, l) => sum + l.count, 0);

@@ -156,7 +156,7 @@ test('damaged, cut and foreign bytes are counted, and what they held is lost whe
         assert.ok(lost > 0, about);
         await untilText(page, 'footer', 'frames lost');
       }
-      if (about !== 'a piece that is missing') await untilText(page, '#view-board', 'damaged on their way');
+      if (about !== 'a piece that is missing') await untilText(page, '#view-board', 'Damaged on their way');
       await page.done();
     } finally {
       await board.stop();
@@ -256,7 +256,7 @@ test('a trace takes the place of what a board has sent only when the user says s
     assert.equal(await frames(page), had);
     await page.locator('.shell > input[type=file]').setInputFiles([file]);
     await page.getByRole('button', { name: 'Discard it' }).click();
-    await untilText(page, 'footer', '1 frames in');
+    await untilText(page, 'footer', '1 frame in');
     assert.ok(await page.locator('.tools.live').isHidden());
     await page.done();
   } finally {

@@ -122,7 +122,7 @@ test('fixed view and periods give the identifier’s period', async () => {
 test('bits: changes are counted, a signal is made of them, and its DBC is read again', async () => {
   const page = await opened('bits');
   await untilText(page, '#view-bits .state', '4 000 frames');
-  assert.match(await page.locator('#bit-23').getAttribute('aria-label'), /byte 2 bit 0: 3999 changes/);
+  assert.match(await page.locator('#bit-23').getAttribute('aria-label'), /byte 2 bit 0: 3.999 changes/);
   const from = await page.locator('#bit-40').boundingBox();
   const to = await page.locator('#bit-47').boundingBox();
   await page.mouse.move(from.x + 5, from.y + 5);
@@ -178,6 +178,6 @@ test('a file of no known format is refused in words, and the page goes on', asyn
   await until(page, 'the second file is refused, too', () => document.querySelectorAll('.notice.error').length === 2);
   await show(page, 'trace');
   await page.locator('#trace-filter').fill('100');
-  await untilText(page, '#view-trace .state', '1 of 1 records');
+  await untilText(page, '#view-trace .state', '1 of 1 record');
   await page.done();
 });

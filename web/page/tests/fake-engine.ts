@@ -1,6 +1,6 @@
 // An engine for the page's tests: a computed trace of any length, one record each millisecond. It never ships: the real one is `web/engine`.
 
-import type { Answer, Engine, Gap, MessageInfo, Requests, Row, Series, SignalEdit, SignalInfo, Summary } from '../src/api';
+import type { Answer, Engine, Gap, Interval, MessageInfo, Requests, Row, Series, SignalEdit, SignalInfo, Summary } from '../src/api';
 
 const STEP = 0.001;
 const LOSS_EVERY = 5000;
@@ -85,12 +85,13 @@ export class FakeEngine implements Engine {
       losses: lost === 0 ? [] : [{ stage: 'device queue', channel: 1, count: lost * 7, atLeast: true }],
       issues: [],
       growing,
+      deviceTimes: true,
       progress: growing ? 0.5 : 1,
     };
   }
 
   #row(index: number): Row {
-    const base: Row = { index, time: index * STEP, late: index % 97 === 5, channel: 1, kind: 'data', id: null, extended: false, dlc: null, data: '', sent: false, text: '', message: null };
+    const base: Row = { index, time: index * STEP, above: null, late: index % 97 === 5, channel: 1, kind: 'data', id: null, extended: false, dlc: null, data: '', sent: false, text: '', message: null };
     if (index % LOSS_EVERY === LOSS_EVERY - 1) return { ...base, kind: 'lost', text: 'at least 7 frames lost in the device queue' };
     const which = IDS[index % 4] as (typeof IDS)[number];
     const speed = value(11, base.time);
@@ -103,6 +104,11 @@ export class FakeEngine implements Engine {
     const text = this.#filters[view] ?? '';
     if (text === '') return row;
     return row * 4 + Math.max(0, IDS.findIndex((i) => i.id === parseInt(text, 16)));
+  }
+
+  /** By a device whose clock is 400 ppm fast. */
+  #interval(from: number, to: number): Interval {
+    return { seconds: (to - from) * 1.0004, byDevice: true };
   }
 
   #length(view: number): number {
@@ -169,7 +175,11 @@ export class FakeEngine implements Engine {
       if (view < 0) view = this.#filters.push(filter) - 1;
       return { view, rows: this.#length(view) };
     },
-    rows: ({ view, from, count }) => Array.from({ length: Math.max(0, Math.min(count, this.#length(view) - from)) }, (_, i) => this.#row(this.#at(view, from + i))),
+    rows: ({ view, from, count }) =>
+      Array.from({ length: Math.max(0, Math.min(count, this.#length(view) - from)) }, (_, i) => {
+        const [index, above] = [this.#at(view, from + i), this.#at(view, from + i - 1)];
+        return { ...this.#row(index), above: from + i > 0 ? this.#interval(above * STEP, index * STEP) : null };
+      }),
     rowAt: ({ view, time }) => ({ row: Math.min(this.#length(view) - 1, Math.ceil(time / STEP / ((this.#filters[view] ?? '') === '' ? 1 : 4))) }),
     find: ({ view, text, from, backwards }) => {
       for (let row = from + (backwards ? -1 : 1), tries = 0; row >= 0 && row < this.#length(view) && tries < 100_000; row += backwards ? -1 : 1, tries++) {
@@ -190,7 +200,7 @@ export class FakeEngine implements Engine {
         const row = this.#row(index);
         const changed = new Float64Array(row.data.length * 4).fill(NaN);
         for (let bit = changed.length - 1, age = 0; bit >= 0; bit -= 1, age += 0.3) changed[bit] = row.time - age;
-        return { channel: 1, id, extended, message: name, count: Math.floor(this.#records / 4), period: { median: 0.004, min: 0.0039, max: 0.0061 }, lastTime: row.time, lastData: row.data, changed, signals: this.#handlers.decode({ index }) };
+        return { channel: 1, id, extended, message: name, count: Math.floor(this.#records / 4), period: { median: 0.004, min: 0.0039, max: 0.0061, byDevice: true }, lastTime: row.time, lastData: row.data, changed, signals: this.#handlers.decode({ index }) };
       });
     },
     bits: ({ id, extended }) => {
@@ -203,9 +213,10 @@ export class FakeEngine implements Engine {
     rawSeries: ({ from, to, columns }) => this.#series(11, from, to, columns),
     load: ({ from, to, columns }) => ({ time: Float64Array.from({ length: columns }, (_, i) => from + ((to - from) * i) / columns), load: Float64Array.from({ length: columns }, (_, i) => 0.25 + 0.1 * Math.sin(from + ((to - from) * i) / columns)) }),
     gaps: () => this.#gaps(),
-    periods: () => ({ edges: Float64Array.from({ length: 41 }, (_, i) => 0.0038 + i * 0.00006), counts: Uint32Array.from({ length: 40 }, (_, i) => Math.round(9000 * Math.exp(-((i - 5) ** 2) / 4)) + (i === 37 ? 1 : 0)), min: 0.0039, max: 0.0061, mean: 0.004, deviation: 0.00012 }),
+    interval: ({ from, to }) => this.#interval(from, to),
+    periods: () => ({ edges: Float64Array.from({ length: 41 }, (_, i) => 0.0038 + i * 0.00006), counts: Uint32Array.from({ length: 40 }, (_, i) => Math.round(9000 * Math.exp(-((i - 5) ** 2) / 4)) + (i === 37 ? 1 : 0)), min: 0.0039, max: 0.0061, mean: 0.004, deviation: 0.00012, byDevice: true }),
     conversations: () => ({
-      events: Array.from({ length: 300 }, (_, i) => ({ time: i * 0.05, end: i * 0.05 + 0.012, channel: 1, protocol: i % 3 ? 'UDS' : 'J1939', kind: i % 2 ? 'answer' : 'request', from: i % 2 ? 'ECU 7E8' : 'tester', to: i % 3 ? (i % 2 ? 'tester' : 'ECU 7E8') : '', text: `ReadDataByIdentifier F190, part ${i}`, failed: i % 17 === 0 })),
+      events: Array.from({ length: 300 }, (_, i) => ({ time: i * 0.05, end: i * 0.05 + 0.012, took: this.#interval(0, 0.012), channel: 1, protocol: i % 3 ? 'UDS' : 'J1939', kind: i % 2 ? 'answer' : 'request', from: i % 2 ? 'ECU 7E8' : 'tester', to: i % 3 ? (i % 2 ? 'tester' : 'ECU 7E8') : '', text: `ReadDataByIdentifier F190, part ${i}`, failed: i % 17 === 0 })),
       total: 300,
     }),
     findings: () => [

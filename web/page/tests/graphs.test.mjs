@@ -74,6 +74,9 @@ test('two cursors give the exact values at their times, and the differences', as
   const [a, b] = [/A (\d+)/.exec(text)[1], /B (\d+)/.exec(text)[1]].map(Number);
   const state = await page.locator('#view-graphs .state').textContent();
   const [ta, tb] = [/A ([\d.]+) s/.exec(state)[1], /B ([\d.]+) s/.exec(state)[1]].map(Number);
+  // The tests' device is 400 ppm fast.
+  const apart = /Δt ([\d.]+) s .* by the device’s clock/.exec(state)[1];
+  assert.ok(Math.abs(apart - (tb - ta) * 1.0004) < 3e-6, state);
   const at = (t) => Math.round(80 + 15 * Math.sin((Math.floor(t / 0.004 + 1e-9) * 0.004) / 7));
   assert.deepEqual([a, b], [at(ta), at(tb)]);
   await page.keyboard.press('m');

@@ -75,6 +75,31 @@ const look = (ms) =>
     ms,
   );
 
+/** Milliseconds from a key to the picture that answers it: a view that is changed, or a row above that is selected. */
+const key = (name, answered) =>
+  tab.evaluate(
+    ([name, answered]) =>
+      new Promise((done) => {
+        const state = new Function(`return ${answered}`);
+        const before = state();
+        const start = performance.now();
+        document.activeElement.dispatchEvent(new KeyboardEvent('keydown', { key: name, bubbles: true }));
+        const step = () => (state() === before ? requestAnimationFrame(step) : requestAnimationFrame(() => done(performance.now() - start)));
+        step();
+      }),
+    [name, answered],
+  );
+
+async function keys() {
+  const took = [];
+  for (let i = 0; i < 5; i++) {
+    for (const [name, view] of [['4', 'fixed'], ['3', 'graphs'], ['2', 'trace']]) took.push(await key(name, `!document.querySelector('#view-${view}').hidden`));
+    await tab.locator('#view-trace .list').focus();
+    for (let n = 0; n < 5; n++) took.push(await key('ArrowUp', `document.querySelector('#view-trace .list-row.selected:not([hidden])')?.dataset.index`));
+  }
+  return took.sort((a, b) => a - b);
+}
+
 const n = (value, digits = 0) => (value === undefined ? '–' : value.toFixed(digits));
 console.log('second  view      redraws/s  rows/s  longest ms  records/s  lag ms (worst)  behind  MB page  MB objects  MB engine  MB cantap  losses');
 const views = ['trace', 'fixed', 'graphs'];
@@ -88,6 +113,9 @@ for (let round = 0; Date.now() - begin < Number(seconds) * 1000; round++) {
   const [objects, engine] = await inPage();
   console.log([n((Date.now() - begin) / 1000).padStart(6), view.padEnd(8), n(found.redraws, 1).padStart(10), n(found.rows, 1).padStart(7), n(found.longest).padStart(11), n(found.records).padStart(10), `${n(found.lag)} (${n(found.worst)})`.padStart(15), String(found.behind).padStart(7), n(await renderer()).padStart(8), n(objects, 1).padStart(10), n(engine).padStart(9), n(memory(server.child.pid)).padStart(10), found.lost].join('  '));
 }
+await show(tab, 'trace');
+const took = await keys();
+console.log(`keys: median ${n(took[Math.floor(took.length / 2)], 1)} ms, worst ${n(took.at(-1), 1)} ms of ${took.length}`);
 await tab.context().close();
 await server.stop();
 await quit();

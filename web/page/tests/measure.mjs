@@ -61,5 +61,41 @@ console.log(`${await page.locator('.panel').count()} graphs`);
 await run('zooming in', '#view-graphs', wheel(0.5, 'deltaY: -40'));
 await run('panning', '#view-graphs', wheel(0.5, 'deltaX: i % 120 < 60 ? 12 : -12'));
 await run('zooming out', '#view-graphs', wheel(0.5, 'deltaY: 40'));
+
+// From everything to a millisecond and back by one key each: undo and redo of a zoom.
+const state = () => page.evaluate(() => ({ ...document.querySelector('#view-graphs').dataset }));
+await page.keyboard.press('0');
+for (let i = 0; i < 100 && Number((await state()).to) - Number((await state()).from) > 0.001; i++) {
+  await page.evaluate(([s]) => new Function(s)(), [wheel(0.5, 'deltaY: -800')]);
+  await page.waitForTimeout(20);
+}
+const near = await state();
+await page.keyboard.press('0');
+await page.waitForFunction(() => document.querySelector('#view-graphs').dataset.busy === 'false');
+/** Presses a key, and counts the browser's frames and the milliseconds until the graphs show all of another stretch. */
+const leap = (key) =>
+  page.evaluate(
+    (key) =>
+      new Promise((done) => {
+        const view = document.querySelector('#view-graphs');
+        const before = view.dataset.to;
+        const start = performance.now();
+        let frames = 0;
+        document.activeElement.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true}));
+        // Looked at when the frame's picture has been drawn.
+        const drawn = () => (view.dataset.to !== before && view.dataset.busy === 'false' ? done({ frames, ms: performance.now() - start }) : requestAnimationFrame(step));
+        const step = () => {
+          frames++;
+          setTimeout(drawn);
+        };
+        requestAnimationFrame(step);
+      }),
+    key,
+  );
+console.log(`a millisecond: ${(near.to - near.from) * 1000} ms of ${near.from} s`);
+for (let i = 0; i < 5; i++) {
+  const [to, back] = [await leap('Backspace'), await leap('0')];
+  console.log(`to a millisecond: ${to.frames} frames, ${to.ms.toFixed(0)} ms; to everything: ${back.frames} frames, ${back.ms.toFixed(0)} ms`);
+}
 await page.context().close();
 await quit();

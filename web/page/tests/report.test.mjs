@@ -4,7 +4,7 @@ import { tmpdir } from 'node:os';
 import { join } from 'node:path';
 import { after, test } from 'node:test';
 import { gzipSync } from 'node:zlib';
-import { FAKE, newPage, quit, saved, until, untilText } from './browser.mjs';
+import { FAKE, newPage, quit, saved, show, until, untilText } from './browser.mjs';
 
 const folder = mkdtempSync(join(tmpdir(), 'cantap-page-'));
 after(async () => {
@@ -50,6 +50,33 @@ test('a report opens by itself: notes, findings, databases, and the trace comes 
   const file = await saved(page, () => page.getByRole('button', { name: 'Save the trace' }).click());
   assert.equal(file.name, 'drive.log');
   assert.ok(file.bytes.equals(trace));
+  await page.done();
+});
+
+test('the worst finding comes first, whoever found it, and the report’s notes are among the notes', async () => {
+  const finding = (severity, text) => ({ severity, text, time: null, channel: 1, id: null, extended: false });
+  const page = await newPage({ file: write('order.html', json(report({ findings: [finding('info', 'Against old.log'), finding('warning', '200 is new')] }))) });
+  await untilText(page, '#view-summary', 'At least 7 frames were lost');
+  const severities = await page.locator('#view-summary .findings .severity').allTextContents();
+  assert.deepEqual(severities, ['error', 'warning', 'warning', 'info', 'info']);
+  await show(page, 'notes');
+  await untilText(page, '#view-notes', 'Brake <i>pedal</i> at 12 s');
+  await page.done();
+});
+
+test('the first page is printed whole, dark on white, without its controls', async () => {
+  const findings = Array.from({ length: 80 }, (_, n) => ({ severity: 'warning', text: `Finding ${n}`, time: n, channel: 1, id: null, extended: false }));
+  const page = await newPage({ file: write('print.html', json(report({ findings }))), theme: 'dark', size: { width: 800, height: 600 } });
+  await untilText(page, '#view-summary', 'Finding 79');
+  await page.emulateMedia({ media: 'print' });
+  const seen = await page.evaluate(() => {
+    const luminance = getComputedStyle(document.body).color.match(/\d+/g).slice(0, 3).map(Number).reduce((a, b) => a + b);
+    const last = document.querySelector('#view-summary .findings li:last-child').getBoundingClientRect();
+    return { luminance, height: document.documentElement.scrollHeight, last: last.bottom, header: document.querySelector('.shell > header').getBoundingClientRect().height };
+  });
+  assert.ok(seen.luminance < 300, JSON.stringify(seen));
+  assert.equal(seen.header, 0);
+  assert.ok(seen.height > 1200 && seen.last <= seen.height, JSON.stringify(seen));
   await page.done();
 });
 

@@ -30,7 +30,8 @@ for (const theme of ['dark', 'light']) {
       const search = page.getByRole('searchbox', { name: 'Search messages and signals' });
       for (const name of SIGNALS) {
         await search.fill(name);
-        await page.locator('#view-graphs .tree-signal').first().click();
+        // Not another one that has the name within its own.
+        await page.locator('#view-graphs .tree-signal', { has: page.getByText(name, { exact: true }) }).first().click();
       }
       await search.fill('ECM');
       await page.waitForFunction(() => document.querySelector('#view-graphs').dataset.busy === 'false');

@@ -66,3 +66,27 @@ test('a page that may send does so after a question', async () => {
     await server.stop();
   }
 });
+
+test('a server has a page at each address, each with its own token', async () => {
+  const server = await serveShared(['-d', 'virtual:car', '--web', '0']);
+  try {
+    while (server.urls.length < 2) await new Promise((again) => setTimeout(again, 20));
+    const [first, second] = server.urls.map((url) => new URL(url));
+    assert.notEqual(first.port, second.port);
+    assert.notEqual(first.search, second.search);
+    const page = await newPage({ url: second.href });
+    await page.locator('.shell').waitFor();
+    await untilReceived(page, 100);
+    await page.done();
+    const stranger = await fetch(`${second.origin}/${first.search}`);
+    assert.notEqual(stranger.status, 200);
+  } finally {
+    await server.stop();
+  }
+});
+
+test('two pages at one address are refused before anything is opened', async () => {
+  const { status, stderr } = spawnSync(resolve(process.env.CANTAP_TEST_PROGRAM), ['serve', '-d', 'virtual:car', '--web', '127.0.0.1:29577', '--web', '127.0.0.1:29577'], { env: { ...process.env, CANTAP_PAGE: resolve(process.env.CANTAP_TEST_PAGE) } });
+  assert.equal(status, 2);
+  assert.match(stderr.toString(), /--web is given twice for 127.0.0.1:29577; give each another address or port/);
+});

@@ -16,10 +16,14 @@ export async function serve(args, { folder = mkdtempSync(join(tmpdir(), 'cantap-
   child.stderr.on('data', (text) => (errors += text));
   const ended = new Promise((done) => child.on('close', done));
   const lines = createInterface({ input: child.stdout });
-  const url = await Promise.race([new Promise((found) => lines.on('line', (line) => /^https?:/.test(line) && found(line))), ended]);
+  const urls = [];
+  lines.on('line', (line) => /^https?:/.test(line) && urls.push(line));
+  const url = await Promise.race([new Promise((found) => lines.on('line', () => urls.length > 0 && found(urls[0]))), ended]);
   if (typeof url !== 'string') throw new Error(`cantap ${command[0]} ended: ${errors}`);
   return {
     url,
+    /** All of them, as they are printed. */
+    urls,
     folder,
     child,
     errors: () => errors,

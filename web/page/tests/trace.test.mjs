@@ -80,6 +80,19 @@ test('times are shown since the start, in UTC or since the row above', async () 
   await page.done();
 });
 
+// The tests' device is 400 ppm fast.
+test('a difference of rows is the device’s, and the details say so', async () => {
+  const page = await opened('trace');
+  await page.locator('#trace-filter').fill('100');
+  await until(page, 'the filtered rows', () => document.querySelector('#view-trace .list-row[data-index="2"] .c-time')?.textContent === '0.008000');
+  await page.locator('#view-trace .list-row[data-index="2"]').click();
+  await untilText(page, '#view-trace .details', '0.004002 s by the device’s clock');
+  await page.keyboard.press('t');
+  await page.keyboard.press('t');
+  await until(page, 'a difference', () => document.querySelector('#view-trace .list-row[data-index="2"] .c-time').textContent === '+0.004002');
+  await page.done();
+});
+
 test('ten million rows: the bar leaps, the wheel moves by rows, both ends are reached', async () => {
   const page = await opened('trace', { records: 10_000_000 });
   await focus(page);

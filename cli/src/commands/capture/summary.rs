@@ -9,6 +9,7 @@ use cantap_address::Address;
 use cantap_analysis::stats::is_of_a_part;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
+use cantap_trace::counted;
 use cantap_work::boards::Boards;
 use cantap_work::bus_hints::BusHint;
 use cantap_work::live::{Line, LiveRecords};
@@ -137,9 +138,16 @@ impl Summary {
             eprintln!("{}", channel.line(self.seconds));
         }
         if let Some(TriggerSummary { events, kept, forgotten }) = &self.trigger {
-            eprintln!("trigger: {events} events, {kept} records kept");
+            eprintln!(
+                "trigger: {events}, {kept} kept",
+                events = counted(events, "event"),
+                kept = counted(kept, "record")
+            );
             if *forgotten > 0 {
-                eprintln!("{forgotten} records before events were too many to remember; use a shorter --pre");
+                eprintln!(
+                    "{forgotten} before events were too many to remember; use a shorter --pre",
+                    forgotten = counted(forgotten, "record")
+                );
             }
         }
         if self.is_closed {
@@ -268,6 +276,10 @@ impl ChannelSummary {
         } else {
             String::new()
         };
-        format!("channel {channel}: {frames} frames{rate}{load}{over}, {lost} lost, {bus_errors} bus errors")
+        format!(
+            "channel {channel}: {frames}{rate}{load}{over}, {lost} lost, {bus_errors}",
+            frames = counted(frames, "frame"),
+            bus_errors = counted(bus_errors, "bus error")
+        )
     }
 }

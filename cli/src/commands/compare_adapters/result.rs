@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use cantap::{TraceEvent, TraceRecord};
 use cantap_analysis::align::Comparison;
+use cantap_trace::counted;
 use cantap_work::live::LiveRecords;
 use cantap_work::{Losses, rounded};
 
@@ -82,7 +83,7 @@ impl Adapter {
     pub fn nothing_received(&self) -> String {
         let errors = match self.bus_errors {
             0 => String::new(),
-            errors => format!(", but {errors} bus errors"),
+            errors => format!(", but {errors}", errors = counted(errors, "bus error")),
         };
         format!(
             "'{}' received no frame{errors}, so there is nothing to compare; check that it is on the same bus as the other, its channel (-c) and the bit \
@@ -117,8 +118,9 @@ impl Adapter {
             ),
         };
         format!(
-            "'{device}': {frames} frames{bounds}; {missed} missed that '{other}' has{remote}{more}{left}; knows to have lost: {}",
-            lost.line()
+            "'{device}': {frames}{bounds}; {missed} missed that '{other}' has{remote}{more}{left}; knows to have lost: {}",
+            lost.line(),
+            frames = counted(frames, "frame")
         )
     }
 }
@@ -199,8 +201,10 @@ impl Outcome {
         let [first, second] = &self.adapters;
         write!(
             out,
-            "{} frames in both in {} s, {} of them in another order",
-            self.frames_in_both, self.seconds, self.out_of_order
+            "{} in both in {} s, {} of them in another order",
+            counted(self.frames_in_both, "frame"),
+            self.seconds,
+            self.out_of_order
         )?;
         match self.ambiguous {
             0 => writeln!(out)?,
@@ -214,7 +218,7 @@ impl Outcome {
         writeln!(out, "{}", second.line(&first.device))?;
         let set = match self.clock_set {
             0 => String::new(),
-            times => format!("; a clock jumped {times} times meanwhile"),
+            times => format!("; a clock jumped {times} meanwhile", times = counted(times, "time")),
         };
         // A minus sign before zero says nothing.
         writeln!(

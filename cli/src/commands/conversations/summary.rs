@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::{Event, Protocol};
+use cantap_trace::counted;
 
 /// Counts.
 #[derive(Default)]
@@ -60,7 +61,7 @@ impl Summary {
         }
         let said =
             if said.is_empty() { "nothing that a protocol explains".to_owned() } else { said.join(", ") };
-        eprintln!("cantap: {} frames: {said}", self.frames);
+        eprintln!("cantap: {}: {said}", counted(self.frames, "frame"));
         if self.uncounted > 0 {
             eprintln!(
                 "cantap: frames may be missing that nobody counted: the adapter does not report its losses"
@@ -68,9 +69,15 @@ impl Summary {
         }
         let places = self.gaps - self.uncounted;
         if places > 0 {
-            let lost =
-                if self.lost == 0 { "frames".to_owned() } else { format!("{} frames or more", self.lost) };
-            eprintln!("cantap: {lost} are missing in the trace, at {places} places");
+            let lost = if self.lost == 0 {
+                "frames".to_owned()
+            } else {
+                format!("{} or more", counted(self.lost, "frame"))
+            };
+            eprintln!(
+                "cantap: {lost} are missing in the trace, at {places}",
+                places = counted(places, "place")
+            );
         }
     }
 }

@@ -6,11 +6,11 @@ use std::io::Write;
 use cantap::TraceRecord;
 use cantap_analysis::stats::{IdStatistics, Options, Statistics};
 use cantap_signals::{Decoder, MessageRef};
+use cantap_trace::counted;
 use serde_json::json;
 
 use super::describe::header_id;
 use crate::input::Records;
-use cantap_work::terms::counted;
 
 /// A cycle differs from the database's if it deviates by more than this fraction.
 const TOLERANCE: f64 = 0.1;
@@ -149,7 +149,8 @@ pub fn run(decoder: &Decoder, mut records: Records, json: bool, out: &mut impl W
     let share = if frames > 0 { covered as f64 * 100.0 / frames as f64 } else { 0.0 };
     writeln!(out, "{covered} of {frames} frames are in the databases ({share:.1} %)")?;
     if unlisted > 0 {
-        writeln!(out, "{unlisted} frames have identifiers beyond those that are followed one by one")?;
+        let frames = counted(unlisted, "frame");
+        writeln!(out, "{frames} of identifiers beyond those that are followed one by one")?;
     }
     let ms = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
     writeln!(out, "\nNot in the databases: {}", counted(unknown.len(), "identifier"))?;
@@ -167,7 +168,7 @@ pub fn run(decoder: &Decoder, mut records: Records, json: bool, out: &mut impl W
             ms(heard.max_ms)
         )?;
     }
-    writeln!(out, "\nNever came: {} of {} messages", never.len(), decoder.messages().count())?;
+    writeln!(out, "\nNever came: {} of {}", never.len(), counted(decoder.messages().count(), "message"))?;
     for (_, _, message) in &never {
         let cycle = message.cycle_ms.map_or(String::new(), |cycle| format!(", every {cycle} ms"));
         writeln!(out, "  {:<8} {}{cycle}", message.id.to_string(), message.name)?;

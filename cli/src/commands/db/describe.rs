@@ -5,9 +5,8 @@ use std::io::Write;
 use cantap_signals::{
     ByteOrder, Container, ContainerHeader, Database, Message, Selection, Signal, Suggestion, ValueKind,
 };
+use cantap_trace::counted;
 use serde_json::{Value, json};
-
-use cantap_work::terms::counted;
 
 /// Shows the requested messages.
 pub fn run(
@@ -56,7 +55,7 @@ impl Wanted {
 }
 
 fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
-    write!(out, "{} {}, {}", message.id, message.name, counted(message.length.into(), "byte"))?;
+    write!(out, "{} {}, {}", message.id, message.name, counted(message.length, "byte"))?;
     if let Some(cycle) = message.cycle_ms {
         write!(out, ", every {cycle} ms")?;
     }
@@ -71,7 +70,7 @@ fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
                 "    {} {}, {}",
                 header_id(container, pdu.header_id),
                 pdu.name,
-                counted(pdu.length.into(), "byte")
+                counted(pdu.length, "byte")
             )?;
             if let Some(cycle) = pdu.cycle_ms {
                 write!(out, ", every {cycle} ms")?;
@@ -104,7 +103,7 @@ fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
             "  {}: bit {}, {}, {order}, {}, x {}",
             signal.label(),
             signal.start,
-            counted(signal.length.into(), "bit"),
+            counted(signal.length, "bit"),
             kind(signal.kind),
             signal.factor
         )?;

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use cantap_protocols::odx::{Ecu, Odx};
-use cantap_work::terms::counted;
+use cantap_trace::counted;
 use serde_json::{Value, json};
 
 /// Lists the content of files, or what is not understood in them.

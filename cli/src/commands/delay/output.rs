@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use cantap_analysis::delay::{DelayOptions, Delays, Figures, Outcome, STEPS_NS};
+use cantap_trace::counted;
 use cantap_work::missing::Missing;
 use serde_json::{Value, json};
 
@@ -28,8 +29,9 @@ impl Output {
         let DelayOptions { from, to, within_ns } = self.options;
         writeln!(
             out,
-            "channel {from} to channel {to}, within {} ms; delays in ms, from end of frame to end of frame\n",
-            ms(within_ns as f64)
+            "channel {from} to channel {to}, within {} ms; delays in ms, from end of frame to end of frame{}\n",
+            ms(within_ns as f64),
+            self.clock()
         )?;
         writeln!(
             out,
@@ -48,13 +50,23 @@ impl Output {
         notes.iter().try_for_each(|note| writeln!(out, "{note}"))
     }
 
+    /// Whose clock measured the delays, if there are two.
+    fn clock(&self) -> &'static str {
+        let Figures { delays, by_device, .. } = &self.outcome.total;
+        match *by_device {
+            0 => "",
+            all if all == delays.count() => ", by the device's clock",
+            _ => ", by the device's clock where it stamped both frames",
+        }
+    }
+
     /// What limits the figures, one sentence each.
     fn notes(&self) -> Vec<String> {
         let Outcome { total, not_expected, beyond, step_ns, uncounted, breaks, .. } = &self.outcome;
         let DelayOptions { from, to, .. } = self.options;
         let undecided = &total.undecided;
         let shortest_ms = total.shortest_repeat_ns.map_or(0.0, |ns| ms(ns as f64));
-        let counted = [
+        let limits = [
             (total.replaced, format!("replaced on channel {to} by a newer one within the rule's period")),
             (
                 undecided.start,
@@ -81,11 +93,16 @@ impl Output {
             (*not_expected, format!("on channel {from} that are not expected on channel {to}")),
             (*beyond, "of identifiers beyond those listed".to_owned()),
         ];
-        let mut notes: Vec<_> = counted
+        let by_utc = total.delays.count() - total.by_device;
+        let mut notes: Vec<_> = limits
             .into_iter()
             .filter(|(count, _)| *count > 0)
-            .map(|(count, text)| format!("{count} {} {text}", if count == 1 { "frame" } else { "frames" }))
+            .map(|(count, text)| format!("{} {text}", counted(count, "frame")))
             .collect();
+        if total.by_device > 0 && by_utc > 0 {
+            notes
+                .push(format!("{} by UTC, because the device's time is not known", counted(by_utc, "delay")));
+        }
         if let Some(step) = step_ns {
             let step = ms(*step as f64);
             notes.push(format!(
@@ -99,7 +116,8 @@ impl Output {
             );
         }
         if *breaks > 0 {
-            notes.push(format!("the clock was set back {breaks} times: nothing was matched across that"));
+            let times = counted(breaks, "time");
+            notes.push(format!("the clock was set back {times}: nothing was matched across that"));
         }
         notes
     }
@@ -169,7 +187,9 @@ fn histogram(delays: &Delays, out: &mut impl Write) -> std::io::Result<()> {
 }
 
 fn object(figures: &Figures) -> Value {
-    let Figures { matched, missing, extra, replaced, undecided, ambiguous, late, repeated, .. } = figures;
+    let Figures {
+        matched, missing, extra, replaced, undecided, ambiguous, late, repeated, by_device, ..
+    } = figures;
     let delays = &figures.delays;
     let delay = delays.min_ns().map(|min| {
         let mut delay = json!({
@@ -193,5 +213,6 @@ fn object(figures: &Figures) -> Value {
         "repeated": repeated,
         "shortest_repeat_ms": figures.shortest_repeat_ns.map(|ns| ms(ns as f64)),
         "delay_ms": delay,
+        "by_device": by_device,
     })
 }

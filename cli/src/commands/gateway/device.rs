@@ -11,6 +11,7 @@ use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
 use cantap::{Device, TraceEvent};
 use cantap_address::OpenDevice;
+use cantap_trace::counted;
 use cantap_work::channel_options::{ChannelOptions, description};
 use cantap_work::gateway::{Counts, Named, Rules};
 use cantap_work::interrupt;
@@ -276,7 +277,8 @@ impl<'a> Watch<'a> {
             for (channel, missed) in (1..).zip(self.missed()).filter(|(_, missed)| *missed > 0) {
                 writeln!(
                     out,
-                    "channel {channel}: at least {missed} frames lost in the controller, before the gateway"
+                    "channel {channel}: at least {missed} lost in the controller, before the gateway",
+                    missed = counted(missed, "frame")
                 )?;
             }
         }

@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use cantap::wire::message::RuleCounts;
 use cantap_formats::WriteOptions;
 use cantap_trace::TraceRecord;
+use cantap_trace::counted;
 use cantap_work::gateway::{DryRun, DryRunCounts, Rules, Sent};
 use cantap_work::missing::Missing;
 use serde_json::{Value, json};
@@ -92,13 +93,17 @@ fn print(rules: &Rules, counts: &DryRunCounts, out: &mut impl Write) -> std::io:
         )?;
     }
     for (channel, unmatched) in (1..).zip(counts.unmatched).filter(|(_, unmatched)| *unmatched > 0) {
-        writeln!(out, "{unmatched} frames of channel {channel} matched no rule and are not passed on")?;
+        writeln!(
+            out,
+            "{unmatched} of channel {channel} matched no rule and are not passed on",
+            unmatched = counted(unmatched, "frame")
+        )?;
     }
     if counts.not_received > 0 {
         writeln!(
             out,
-            "{} frames of other channels, or of CAN FD, which a device does not receive",
-            counts.not_received
+            "{} of other channels, or of CAN FD, which a device does not receive",
+            counted(counts.not_received, "frame")
         )?;
     }
     Ok(())

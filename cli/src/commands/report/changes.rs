@@ -1,5 +1,6 @@
 //! What has changed against another trace, as findings of the first page.
 
+use cantap_trace::counted;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
@@ -43,11 +44,25 @@ pub fn findings(before: &Profile, after: &Profile, name: &str) -> Vec<Value> {
         }
     };
     let gone = |(key, count): &(Key, u64)| {
-        (*key, format!("{} does not come any more; in {name} it came {count} times", of(*key)))
+        (
+            *key,
+            format!(
+                "{} does not come any more; in {name} it came {count}",
+                of(*key),
+                count = counted(count, "time")
+            ),
+        )
     };
     list(only_a.iter().map(gone).collect());
     let new = |(key, count): &(Key, u64)| {
-        (*key, format!("{} is new: it came {count} times, and not in {name}", of(*key)))
+        (
+            *key,
+            format!(
+                "{} is new: it came {count}, and not in {name}",
+                of(*key),
+                count = counted(count, "time")
+            ),
+        )
     };
     list(only_b.iter().map(new).collect());
     list(changed.iter().filter_map(|changed| Some((changed.key, change(changed, name)?))).collect());
@@ -107,8 +122,8 @@ mod tests {
             texts,
             [
                 "Against old.log: 1 no longer there, 1 new, 2 changed, 0 the same",
-                "200 on channel 1 does not come any more; in old.log it came 1 times",
-                "400 on channel 1 is new: it came 1 times, and not in old.log",
+                "200 on channel 1 does not come any more; in old.log it came 1 time",
+                "400 on channel 1 is new: it came 1 time, and not in old.log",
                 "100 on channel 1 has changed against old.log: period 30.0 ms instead of 10.0 ms",
                 "300 on channel 1 has changed against old.log: DLC 2 instead of 1",
             ]

@@ -9,6 +9,7 @@ use anyhow::Context;
 use cantap_serve::{Board, News, Role};
 #[cfg(feature = "tls")]
 use cantap_serve::{listen::Listening, tls};
+use cantap_trace::counted;
 use cantap_ui::{Device, Hosted, Server, Site, Source, Stopper, Visit, Visits};
 #[cfg(feature = "tls")]
 use cantap_ui::{People, Person};
@@ -52,8 +53,27 @@ pub enum Serving {
 }
 
 impl WebDoor {
-    /// Finds the page, so that a mistake is known before there is a server.
-    pub fn new(text: &str, way: &Way, boards: &Boards, databases: &DatabaseArgs) -> anyhow::Result<Self> {
+    /// One for each of these addresses, so that a mistake is known before there is a server.
+    pub fn all(
+        texts: &[String],
+        way: &Way,
+        boards: &Boards,
+        databases: &DatabaseArgs,
+    ) -> anyhow::Result<Vec<Self>> {
+        let doors: Vec<_> =
+            texts.iter().map(|text| Self::new(text, way, boards, databases)).collect::<Result<_, _>>()?;
+        for (at, door) in doors.iter().enumerate() {
+            if door.address.port() != 0 && doors[..at].iter().any(|other| other.address == door.address) {
+                return Err(usage(format!(
+                    "--web is given twice for {}; give each another address or port",
+                    door.address
+                )));
+            }
+        }
+        Ok(doors)
+    }
+
+    fn new(text: &str, way: &Way, boards: &Boards, databases: &DatabaseArgs) -> anyhow::Result<Self> {
         let (text, is_https) = text.strip_prefix(HTTPS).map_or((text, false), |text| (text, true));
         let address = address(text, PORT)?;
         let is_encrypted = is_https || !address.ip().is_loopback();
@@ -222,9 +242,10 @@ fn visits(board: &Arc<Board>) -> Visits {
             }
             Visit::Refused(reason) => News::Refused { client, reason },
             Visit::Asked(what) => News::Asked { client, what },
-            Visit::Missed(records) => {
-                News::LeftOut { client, what: format!("{records} records, for which it was too slow") }
-            }
+            Visit::Missed(records) => News::LeftOut {
+                client,
+                what: format!("{records}, for which it was too slow", records = counted(records, "record")),
+            },
             Visit::NotDone(reason) => News::NotDone { client, reason },
             _ => return,
         });

@@ -1,5 +1,6 @@
 //! Statistics as text for people.
 
+use cantap_trace::counted;
 use cantap_trace::{BusErrorKind, LossStage};
 use std::fmt::Write as _;
 
@@ -14,13 +15,13 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
     // Writing to a String cannot fail.
     let _ = writeln!(
         out,
-        "{} frames in {:.6} s on {} {}, {} lost, {} errors",
-        summary.frames,
+        "{} in {:.6} s on {} {}, {} lost, {}",
+        counted(summary.frames, "frame"),
         summary.duration_s,
         summary.channels.len(),
         if summary.channels.len() == 1 { "channel" } else { "channels" },
         lost_frames(summary.lost, summary.lost_at_least),
-        summary.errors,
+        counted(summary.errors, "error"),
     );
     if let Some(text) = missing.description() {
         let _ = writeln!(out, "not in these figures: {text}");
@@ -64,8 +65,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     if channel.fd > 0 {
         let _ = writeln!(
             out,
-            "  CAN FD    {} frames ({} with a switched bit rate, {} of an error passive sender)",
-            channel.fd, channel.brs, channel.esi,
+            "  CAN FD    {} ({} with a switched bit rate, {} of an error passive sender)",
+            counted(channel.fd, "frame"),
+            channel.brs,
+            channel.esi,
         );
     }
     let _ = writeln!(
@@ -141,7 +144,7 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             (lost.gateway, LossStage::Gateway.name()),
             (lost.unknown, "unknown"),
         ];
-        let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };
+        let places = counted(lost.gaps, "place");
         let _ = match (lost.total, lost.at_least) {
             // For example while a device was gone.
             (0, _) => writeln!(out, "  lost      an unknown number at {places}"),
@@ -162,7 +165,11 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         let _ = writeln!(out, "  state     {state}{counters}");
     }
     if channel.out_of_order > 0 {
-        let _ = writeln!(out, "  times     {} records are older than the one before", channel.out_of_order);
+        let _ = writeln!(
+            out,
+            "  times     {} older than the one before",
+            counted(channel.out_of_order, "record")
+        );
     }
     if let Some(step_s) = channel.stamp_step_s {
         let _ = writeln!(
@@ -171,10 +178,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         );
     }
     if channel.late > 0 {
-        let _ = writeln!(out, "  times     {} frames have only an upper bound", channel.late);
+        let _ = writeln!(out, "  times     {} with only an upper bound", counted(channel.late, "frame"));
     }
     if channel.transmit_failures > 0 {
-        let _ = writeln!(out, "  sending   {} frames were not sent", channel.transmit_failures);
+        let _ = writeln!(out, "  sending   {} not sent", counted(channel.transmit_failures, "frame"));
     }
     if !channel.peaks.is_empty() {
         out.push_str("  busiest windows\n");
@@ -213,7 +220,7 @@ pub(super) fn remarks(errors: u64, lost: u64, incomplete: bool) -> String {
     let mut text = String::new();
     // Writing to a String cannot fail.
     if errors > 0 {
-        let _ = write!(text, " {errors} errors");
+        let _ = write!(text, " {}", counted(errors, "error"));
     }
     if lost > 0 {
         let _ = write!(text, " {lost} lost");

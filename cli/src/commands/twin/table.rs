@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use cantap_scripts::twin::{Distance, Model, Names, Observed, Role, StreamDistance, Timing};
 use cantap_trace::clean;
+use cantap_trace::counted;
 use cantap_work::missing::Missing;
 use cantap_work::rounded;
 use serde_json::{Value, json};
@@ -15,8 +16,8 @@ pub fn text(model: &Model, trace: &Observed, distance: &Distance, names: Names<'
     let periodic = model.streams.iter().filter(|stream| is_periodic(&stream.timing)).count();
     let _ = writeln!(
         out,
-        "{} identifiers: {periodic} periodic, {} with counters, {} with checksums; {} exchanges of requests and answers",
-        model.streams.len(),
+        "{}: {periodic} periodic, {} with counters, {} with checksums; {} exchanges of requests and answers",
+        counted(model.streams.len(), "identifier"),
         model.streams.iter().filter(|stream| !stream.content.counters.is_empty()).count(),
         model.streams.iter().filter(|stream| stream.content.checksum.is_some()).count(),
         model.exchanges.len()
@@ -26,8 +27,9 @@ pub fn text(model: &Model, trace: &Observed, distance: &Distance, names: Names<'
     }
     let _ = writeln!(
         out,
-        "\ntrace and twin, the first {seconds:.3} s: {} and {} frames",
-        distance.frames[0], distance.frames[1]
+        "\ntrace and twin, the first {seconds:.3} s: {} and {}",
+        distance.frames[0],
+        counted(distance.frames[1], "frame")
     );
     for (channel, [of_trace, of_run]) in &distance.load_pct {
         let _ = writeln!(out, "channel {channel}: load {of_trace:.2} % and {of_run:.2} %");

@@ -7,7 +7,7 @@ use anyhow::anyhow;
 use cantap_protocols::active::server_scan::{FoundServer, Questions, ScanTimes, ServerReply, ServerScan};
 use cantap_protocols::diagnostics::{Diagnostics, reason};
 use cantap_protocols::iso_tp::{Endpoint, Maker};
-use cantap_work::terms::counted;
+use cantap_trace::counted;
 use cantap_work::uds::TransferOptions;
 use serde_json::{Value, json};
 
@@ -184,7 +184,8 @@ fn line(found: &FoundServer, is_unasked: bool) -> String {
     };
     let to_all = if found.functional && found.request.is_some() { ", also to all" } else { "" };
     // One to each question that it may have answered.
-    let flood = if found.answers > 4 { format!(", {} answers", found.answers) } else { String::new() };
+    let flood =
+        if found.answers > 4 { format!(", {}", counted(found.answers, "answer")) } else { String::new() };
     let unasked = if is_unasked { ", also unasked" } else { "" };
     format!("{pair:<32}  {reply}, after {:.1} ms{to_all}{unasked}{flood}", found.after_ns as f64 / 1e6)
 }

@@ -119,6 +119,8 @@ pub struct Figures {
     pub repeated: u64,
     /// The shortest time between two equal frames on the first channel within the window, in nanoseconds.
     pub shortest_repeat_ns: Option<i64>,
-    /// The delays.
+    /// The delays: as the device measured them where it stamped both frames, otherwise differences of UTC.
     pub delays: Delays,
+    /// Of the delays: as a device measured them.
+    pub by_device: u64,
 }

@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
 
-use cantap_trace::{Id, LossStage, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{Id, LossStage, Moment, TraceEvent, TraceFrame, TraceRecord};
 
 use super::run::{Pair, Run, Waiting};
 use super::{DelayOptions, Expected, Figures, Key, MOST_IDS, Outcome};
@@ -16,7 +16,7 @@ const FINE_NS: u64 = 1_000;
 
 /// A frame of the second channel for which none of the first waited.
 struct Extra {
-    time_ns: i64,
+    at: Moment,
     frame: TraceFrame,
     late: bool,
     counts: bool,
@@ -145,10 +145,10 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
                 self.step_ns = gcd(self.step_ns, time_ns.abs_diff(self.first_ns));
                 if is_from {
                     self.from.frame(time_ns);
-                    self.take_from(time_ns, frame, *late, counts, in_order);
+                    self.take_from(record.moment(), frame, *late, counts, in_order);
                 } else {
                     self.to.frame(time_ns);
-                    self.take_to(time_ns, frame, *late, counts);
+                    self.take_to(record.moment(), frame, *late, counts);
                 }
             }
             event @ TraceEvent::Lost { stage, .. } => {
@@ -178,7 +178,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
         self.outcome
     }
 
-    fn take_from(&mut self, time_ns: i64, frame: &TraceFrame, late: bool, counts: bool, in_order: bool) {
+    fn take_from(&mut self, at: Moment, frame: &TraceFrame, late: bool, counts: bool, in_order: bool) {
+        let time_ns = at.time_ns;
         // The map has to see each frame: rules may count.
         let Some(expected) = (self.map)(frame).filter(|_| counts) else {
             self.outcome.not_expected += 1;
@@ -204,11 +205,10 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
             run.set_replaceable(before);
         }
         let run = self.runs.entry(key).or_default();
-        let repeat_ns =
-            run.last_before(time_ns).map(|last| time_ns.saturating_sub(last)).filter(|gap| *gap <= allowed);
+        let repeat_ns = run.last_before(time_ns).map(|last| at.since_ns(last)).filter(|gap| *gap <= allowed);
         let deadline_ns = time_ns.saturating_add(allowed);
         let id = frame.id();
-        run.push(Waiting { number, time_ns, deadline_ns, id, late, repeat_ns, replaceable: false });
+        run.push(Waiting { number, at, deadline_ns, id, late, repeat_ns, replaceable: false });
         // One window later than it can be found: a pair of equal frames may still have to be changed for another.
         self.deadlines.push(Reverse((deadline_ns.saturating_add(allowed), number)));
         self.keys.insert(number, (key, time_ns));
@@ -220,30 +220,30 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
     /// A frame of the second channel may stand before its cause, if the trace is not in order.
     fn look_back(&mut self, from_ns: i64, until_ns: i64, key: &Key) {
         let found = self.extras.iter().position(|extra| {
-            (from_ns..=until_ns).contains(&extra.time_ns) && Key::new(&extra.frame, key.unknown) == *key
+            (from_ns..=until_ns).contains(&extra.at.time_ns) && Key::new(&extra.frame, key.unknown) == *key
         });
         if let Some(extra) = found.and_then(|at| self.extras.remove(at)) {
-            self.pair(*key, extra.time_ns, extra.late);
+            self.pair(*key, extra.at, extra.late);
         }
     }
 
-    fn take_to(&mut self, time_ns: i64, frame: &TraceFrame, late: bool, counts: bool) {
+    fn take_to(&mut self, at: Moment, frame: &TraceFrame, late: bool, counts: bool) {
         let none = [0; 8];
         let ways = self.unknown.get(&frame.id()).into_iter().flatten();
         let keys = std::iter::once(&none).chain(ways).map(|unknown| Key::new(frame, *unknown));
         let runs: Vec<_> = keys.filter_map(|key| Some((self.runs.get(&key)?, key))).collect();
-        let nearest = runs.iter().filter_map(|(run, key)| Some((run.nearest(time_ns)?, *key)));
+        let nearest = runs.iter().filter_map(|(run, key)| Some((run.nearest(at.time_ns)?, *key)));
         let found = nearest.max_by_key(|(from_ns, _)| *from_ns).map(|(_, key)| key);
-        let found = found
-            .or_else(|| runs.iter().find(|(run, _)| run.has_one_for(time_ns, late)).map(|(_, key)| *key));
+        let found =
+            found.or_else(|| runs.iter().find(|(run, _)| run.has_one_for(at, late)).map(|(_, key)| *key));
         match found {
-            Some(key) => self.pair(key, time_ns, late),
-            None => self.extras.push_back(Extra { time_ns, frame: *frame, late, counts }),
+            Some(key) => self.pair(key, at, late),
+            None => self.extras.push_back(Extra { at, frame: *frame, late, counts }),
         }
     }
 
-    fn pair(&mut self, key: Key, to_ns: i64, to_late: bool) {
-        if let Some(ended) = self.runs.get_mut(&key).and_then(|run| run.pair(to_ns, to_late)) {
+    fn pair(&mut self, key: Key, to: Moment, to_late: bool) {
+        if let Some(ended) = self.runs.get_mut(&key).and_then(|run| run.pair(to, to_late)) {
             for pair in &ended.pairs {
                 self.count_pair(pair, ended.is_certain);
             }
@@ -251,7 +251,7 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
     }
 
     fn count_pair(&mut self, pair: &Pair, is_certain: bool) {
-        let delay_ns = pair.to_ns.saturating_sub(pair.from.time_ns).max(0).unsigned_abs();
+        let delay = pair.to.interval_since(pair.from.at);
         self.count(pair.from.id, |figures| {
             figures.matched += 1;
             figures.late += u64::from(pair.from.late || pair.to_late);
@@ -261,7 +261,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
                     Some(figures.shortest_repeat_ns.map_or(repeat, |shortest| shortest.min(repeat)));
             }
             if is_certain {
-                figures.delays.add(delay_ns);
+                figures.delays.add(delay.ns.max(0).unsigned_abs());
+                figures.by_device += u64::from(delay.by_device);
             } else {
                 figures.ambiguous += 1;
             }
@@ -287,7 +288,8 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
             self.expire(number, false);
         }
         let longest_ns = self.longest_ns;
-        while self.extras.front().is_some_and(|extra| extra.time_ns.saturating_add(longest_ns) < until_ns) {
+        while self.extras.front().is_some_and(|extra| extra.at.time_ns.saturating_add(longest_ns) < until_ns)
+        {
             self.judge_extra();
         }
         let old_ns = until_ns.saturating_sub(longest_ns.saturating_mul(2).saturating_add(DISORDER_NS));
@@ -307,7 +309,7 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
             self.count_pair(&pair, false);
         }
         let may_come = at_end && waiting.deadline_ns >= self.now_ns;
-        let was_lost = self.to.has_gap(waiting.time_ns, waiting.deadline_ns);
+        let was_lost = self.to.has_gap(waiting.at.time_ns, waiting.deadline_ns);
         self.count(waiting.id, |figures| {
             let count = if waiting.replaceable {
                 &mut figures.replaced
@@ -327,9 +329,9 @@ impl<M: FnMut(&TraceFrame) -> Option<Expected>> Matching<M> {
         if !extra.counts {
             return;
         }
-        let earliest_ns = extra.time_ns.saturating_sub(self.longest_ns);
+        let earliest_ns = extra.at.time_ns.saturating_sub(self.longest_ns);
         let before_start = self.start_ns.is_some_and(|start| earliest_ns < start);
-        let was_lost = self.from.has_gap(earliest_ns, extra.time_ns);
+        let was_lost = self.from.has_gap(earliest_ns, extra.at.time_ns);
         self.count(extra.frame.id(), |figures| {
             let count = if was_lost {
                 &mut figures.undecided.loss

@@ -2,13 +2,13 @@
 
 use std::collections::VecDeque;
 
-use cantap_trace::Id;
+use cantap_trace::{Id, Moment};
 
 /// A frame of the first channel that waits for its other.
 #[derive(Clone, Copy, Debug)]
 pub struct Waiting {
     pub number: u64,
-    pub time_ns: i64,
+    pub at: Moment,
     pub deadline_ns: i64,
     pub id: Id,
     pub late: bool,
@@ -21,7 +21,7 @@ pub struct Waiting {
 impl Waiting {
     /// Whether it can be found as a frame at this time.
     fn takes(&self, to_ns: i64) -> bool {
-        (self.time_ns..=self.deadline_ns).contains(&to_ns)
+        (self.at.time_ns..=self.deadline_ns).contains(&to_ns)
     }
 }
 
@@ -29,7 +29,7 @@ impl Waiting {
 #[derive(Clone, Copy, Debug)]
 pub struct Pair {
     pub from: Waiting,
-    pub to_ns: i64,
+    pub to: Moment,
     pub to_late: bool,
 }
 
@@ -41,7 +41,7 @@ pub struct Run {
     pairs: Vec<Pair>,
     /// A pair had to be changed afterwards: another reading of the trace is as good.
     is_rearranged: bool,
-    last_ns: Option<i64>,
+    last: Option<Moment>,
 }
 
 /// No frame of a run waits any more.
@@ -56,28 +56,31 @@ const MOST_REARRANGED: usize = 256;
 /// The same frames, first with first and last with last.
 fn in_order(mut pairs: Vec<Pair>) -> Vec<Pair> {
     let mut causes: Vec<_> = pairs.iter().map(|pair| pair.from).collect();
-    causes.sort_by_key(|from| from.time_ns);
-    pairs.sort_by_key(|pair| pair.to_ns);
+    causes.sort_by_key(|from| from.at.time_ns);
+    pairs.sort_by_key(|pair| pair.to.time_ns);
     pairs.iter_mut().zip(causes).for_each(|(pair, from)| pair.from = from);
     pairs
 }
 
 impl Run {
-    /// A frame on the first channel; returns how long before the one before it came.
+    /// A frame on the first channel.
     pub fn push(&mut self, waiting: Waiting) {
-        self.last_ns = Some(self.last_ns.map_or(waiting.time_ns, |last| last.max(waiting.time_ns)));
-        let at = self.waiting.partition_point(|other| other.time_ns <= waiting.time_ns);
+        let time_ns = waiting.at.time_ns;
+        if self.last.is_none_or(|last| last.time_ns < time_ns) {
+            self.last = Some(waiting.at);
+        }
+        let at = self.waiting.partition_point(|other| other.at.time_ns <= time_ns);
         self.waiting.insert(at, waiting);
     }
 
-    /// The newest frame before a time, in nanoseconds.
-    pub fn last_before(&self, time_ns: i64) -> Option<i64> {
-        self.last_ns.filter(|last| *last <= time_ns)
+    /// When the newest frame before a time came.
+    pub fn last_before(&self, time_ns: i64) -> Option<Moment> {
+        self.last.filter(|last| last.time_ns <= time_ns)
     }
 
     /// The time of the nearest frame that waits for one at `to_ns`.
     pub fn nearest(&self, to_ns: i64) -> Option<i64> {
-        self.position(to_ns).map(|at| self.waiting[at].time_ns)
+        self.position(to_ns).map(|at| self.waiting[at].at.time_ns)
     }
 
     fn position(&self, to_ns: i64) -> Option<usize> {
@@ -85,11 +88,11 @@ impl Run {
     }
 
     /// Pairs it with the nearest, or, if none is left for it, with one that was paired and is replaced there by one that waits.
-    pub fn pair(&mut self, to_ns: i64, to_late: bool) -> Option<Ended> {
-        if let Some(from) = self.position(to_ns).and_then(|at| self.waiting.remove(at)) {
-            self.pairs.push(Pair { from, to_ns, to_late });
+    pub fn pair(&mut self, to: Moment, to_late: bool) -> Option<Ended> {
+        if let Some(from) = self.position(to.time_ns).and_then(|at| self.waiting.remove(at)) {
+            self.pairs.push(Pair { from, to, to_late });
         } else {
-            let (at, pairs) = self.rearranged(to_ns, to_late)?;
+            let (at, pairs) = self.rearranged(to, to_late)?;
             self.waiting.remove(at);
             (self.pairs, self.is_rearranged) = (pairs, true);
         }
@@ -101,20 +104,20 @@ impl Run {
     }
 
     /// Whether [`Self::pair`] has a frame for it.
-    pub fn has_one_for(&self, to_ns: i64, to_late: bool) -> bool {
-        self.position(to_ns).is_some() || self.rearranged(to_ns, to_late).is_some()
+    pub fn has_one_for(&self, to: Moment, to_late: bool) -> bool {
+        self.position(to.time_ns).is_some() || self.rearranged(to, to_late).is_some()
     }
 
     /// All pairs with one more, and the place of the waiting frame that this takes.
-    fn rearranged(&self, to_ns: i64, to_late: bool) -> Option<(usize, Vec<Pair>)> {
+    fn rearranged(&self, to: Moment, to_late: bool) -> Option<(usize, Vec<Pair>)> {
         if self.pairs.is_empty() || self.pairs.len() + self.waiting.len() > MOST_REARRANGED {
             return None;
         }
         (0..self.waiting.len()).rev().find_map(|at| {
             let mut pairs = self.pairs.clone();
-            pairs.push(Pair { from: self.waiting[at], to_ns, to_late });
+            pairs.push(Pair { from: self.waiting[at], to, to_late });
             let pairs = in_order(pairs);
-            pairs.iter().all(|pair| pair.from.takes(pair.to_ns)).then_some((at, pairs))
+            pairs.iter().all(|pair| pair.from.takes(pair.to.time_ns)).then_some((at, pairs))
         })
     }
 
@@ -134,6 +137,8 @@ impl Run {
 
     /// Nothing waits, and nothing came since `time_ns`.
     pub fn is_over(&self, time_ns: i64) -> bool {
-        self.waiting.is_empty() && self.pairs.is_empty() && self.last_ns.is_none_or(|last| last <= time_ns)
+        self.waiting.is_empty()
+            && self.pairs.is_empty()
+            && self.last.is_none_or(|last| last.time_ns <= time_ns)
     }
 }

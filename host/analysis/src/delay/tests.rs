@@ -1,4 +1,4 @@
-use cantap_trace::{Direction, LossStage, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, LossStage, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
 use super::{DelayOptions, Expected, Matching, Outcome};
@@ -60,6 +60,28 @@ fn matched_missing_and_extra_frames_are_told_apart() {
         found.ids.iter().map(|(id, row)| (id.raw(), row.matched, row.missing, row.extra)).collect();
     assert_eq!(ids, [(0x123, 2, 1, 0), (0x124, 0, 0, 1)]);
     assert_eq!(found.step_ns, Some(1_000_000));
+}
+
+/// UTC is corrected while a trace is recorded; the device, 400 ppm fast, measures all the same.
+#[test]
+fn a_delay_is_the_devices_where_it_stamped_both_frames() {
+    let by_device = |record: TraceRecord, ns| TraceRecord { device_ns: DeviceNs::new(ns), ..record };
+    let ns = |ms: u64| 9_000_000_000 + ms * 1_000_400;
+    let mut records = vec![
+        by_device(on(1, 0, "123#01"), ns(0)),
+        by_device(on(2, 50, "123#01"), ns(50)),
+        by_device(on(1, 100, "123#02"), ns(100)),
+        by_device(on(2, 150, "123#02"), ns(150)),
+    ];
+    let found = analyse(&records).total;
+    assert_eq!((found.delays.min_ns(), found.delays.max_ns()), (Some(50_020_000), Some(50_020_000)));
+    assert_eq!((found.by_device, found.shortest_repeat_ns), (2, None));
+    // Another board stamped the second bus.
+    records[1].device_ns = DeviceNs::new(700_000_000);
+    records[3].device_ns = None;
+    let found = analyse(&records).total;
+    assert_eq!((found.delays.min_ns(), found.delays.max_ns()), (Some(50_000_000), Some(50_000_000)));
+    assert_eq!(found.by_device, 0);
 }
 
 #[test]

@@ -1,5 +1,7 @@
 //! Computes where everything in a picture goes.
 
+use cantap_trace::counted;
+
 use super::model::{Axis, Content, Curve, PALETTE, Pane, Plot, colour_of};
 use super::scale::{self, Range};
 use super::scene::{Anchor, Colour, PaneArea, Scene, Shape};
@@ -381,7 +383,7 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
     let label = axis_label(plot, span);
     let middle = f32::midpoint(area.left, area.right);
     let lost: u64 = plot.gaps.iter().map(|gap| gap.frames).sum();
-    let note = format!("{lost} frames lost here");
+    let note = format!("{} lost here", counted(lost, "frame"));
     let note_width = note.chars().count() as f32 * CHARACTER_WIDTH + 18.0;
     // Both are in one line, the label in its middle.
     let room = if plot.gaps.is_empty() {

@@ -3,6 +3,8 @@
 
 use std::fmt::Write as _;
 
+use cantap_trace::counted;
+
 use super::layout::{axis_label, vertical_range};
 use super::model::{Axis, Content, Curve, Gap, Pane, Plot, colour_of};
 use super::scale;
@@ -340,6 +342,7 @@ fn axis(plot: &Plot, span: (f64, f64), style: &TextStyle, out: &mut String) {
     let _ = writeln!(out, "{:padding$}{label}", "");
     if !plot.gaps.is_empty() {
         let lost: u64 = plot.gaps.iter().map(|gap| gap.frames).sum();
-        let _ = writeln!(out, "{:AXIS_WIDTH$}{} {lost} frames lost", "", lost_mark(style.unicode));
+        let _ =
+            writeln!(out, "{:AXIS_WIDTH$}{} {} lost", "", lost_mark(style.unicode), counted(lost, "frame"));
     }
 }

@@ -2,6 +2,7 @@
 
 use std::io;
 
+use cantap_trace::counted;
 use flate2::Decompress;
 
 use super::super::bit_rates::{self, BitRates};
@@ -419,7 +420,8 @@ impl Decoder {
         let len = u32_at(rest, 8) as usize;
         if !(BASE_HEADER_BYTES..=MAX_ITEM_BYTES).contains(&len) || header_len > len {
             self.at += OBJECT_MAGIC.len();
-            let found = format!("an object of {len} bytes with a header of {header_len}");
+            let found =
+                format!("an object of {len} with a header of {header_len}", len = counted(len, "byte"));
             return Object::Issue(Fault::malformed("an object's length", found.as_bytes()));
         }
         let Some(object) = rest.get(..len) else { return Object::Incomplete };
@@ -434,7 +436,7 @@ impl Decoder {
             return Object::Issue(Fault::malformed("an object's header of version 1 or 2", found.as_bytes()));
         }
         if header_len < BASE_HEADER_BYTES + 16 {
-            let found = format!("{header_len} bytes");
+            let found = counted(header_len, "byte");
             return Object::Issue(Fault::malformed("an object's header with a time", found.as_bytes()));
         }
         let time_ns = self.time_ns(u32_at(object, 16), u64_at(object, 24));

@@ -14,6 +14,7 @@ use super::{
     FD64_FORMAT, FD64_PASSIVE_SENDER, FD64_REMOTE, FD64_SWITCHED_BIT_RATE, HAS_SJA1000_CODE, OWN_MARK,
     REMOTE, REQUESTED, SENT,
 };
+use cantap_trace::counted;
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame};
 
@@ -63,8 +64,9 @@ pub(super) fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content
         if found >= len {
             return Ok(());
         }
-        let expected = format!("at least {len} bytes of fields in an object of type {kind}");
-        Err(Fault::malformed(expected, format!("{found} bytes").as_bytes()))
+        let expected =
+            format!("at least {len} of fields in an object of type {kind}", len = counted(len, "byte"));
+        Err(Fault::malformed(expected, counted(found, "byte").as_bytes()))
     };
     let channel = || {
         let channel = u16_at(fields, 0);

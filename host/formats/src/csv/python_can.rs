@@ -12,6 +12,7 @@ use super::super::issue::Fault;
 use super::super::left_out::LeftOut;
 use super::super::text::{self, NS_PER_S};
 use super::rows::{columns, push_time};
+use cantap_trace::counted;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -66,7 +67,7 @@ impl Message {
             return Ok(of(TraceFrame::Fd(frame)));
         }
         if bytes.len() > 8 || self.len > 15 {
-            let found = format!("{} and {} bytes", self.len, bytes.len());
+            let found = format!("{} and {}", self.len, counted(bytes.len(), "byte"));
             return Err(Fault::malformed(
                 "a length that CAN or CAN FD has, and as many bytes",
                 found.as_bytes(),

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::io;
 
 use cantap_trace::PlainFrame;
+use cantap_trace::counted;
 
 use super::super::issue::Fault;
 use super::super::whole::Whole;
@@ -116,7 +117,7 @@ impl Part {
             return Ok((None, signals, faults));
         }
         if groups.len() > 1 && ![1, 2, 4, 8].contains(&id_bytes) {
-            let found = format!("{id_bytes} bytes");
+            let found = counted(id_bytes, "byte");
             return Err(Fault::malformed("records that say of which group they are", found.as_bytes()));
         }
         let by_id = groups.iter().enumerate().map(|(at, group)| (group.record_id, at)).collect();
@@ -337,7 +338,11 @@ impl Part {
         let without = std::mem::take(&mut self.without_values);
         // Where the file is cut, one may lack its values, which is said.
         if without > u64::from(self.is_cut) {
-            let found = format!("{without} frames without theirs, the first at {:#x}", self.first_without);
+            let found = format!(
+                "{without} without theirs, the first at {:#x}",
+                self.first_without,
+                without = counted(without, "frame")
+            );
             return Some(Fault::malformed("the bytes of each frame", found.as_bytes()));
         }
         self.is_end_checked = true;
@@ -356,7 +361,10 @@ impl Part {
         // The counter is damaged, or the file's writer reserved more space than it had records.
         if is_sorted && rest >= self.record_bytes[0].max(1) as u64 {
             let expected = format!("no more data than the {} records that are counted", self.records);
-            return Some(Fault::malformed(expected, format!("{rest} bytes more").as_bytes()));
+            return Some(Fault::malformed(
+                expected,
+                format!("{rest} more", rest = counted(rest, "byte")).as_bytes(),
+            ));
         }
         if is_sorted || !self.is_counted {
             return None;
@@ -367,7 +375,7 @@ impl Part {
             !matches!(group.content, Content::Values) && group.records != **count
         };
         let (group, count) = counts.into_iter().find(differs)?;
-        let expected = format!("{} records of a group, as are counted", group.records);
+        let expected = format!("{} of a group, as are counted", counted(group.records, "record"));
         Some(Fault::malformed(expected, count.to_string().as_bytes()))
     }
 

@@ -1,5 +1,6 @@
 //! The data of a group or channel: bytes in one block or many, plain or compressed.
 
+use cantap_trace::counted;
 use serde::{Deserialize, Serialize};
 
 use super::super::issue::Fault;
@@ -156,7 +157,7 @@ impl Stream {
                 let (kind, columns) = (fields.get(2).copied().unwrap_or(0), u32_at(&fields, 4));
                 let (unpacked, stored) = (u64_at(&fields, 8), u64_at(&fields, 16));
                 if kind > 5 || unpacked > MAX_UNPACKED_BYTES {
-                    let found = format!("kind {kind}, {unpacked} bytes");
+                    let found = format!("kind {kind}, {unpacked}", unpacked = counted(unpacked, "byte"));
                     let expected = format!("data compressed in a known way at {link:#x}");
                     return Err(Fault::malformed(expected, found.as_bytes()));
                 }
@@ -212,7 +213,7 @@ impl Stream {
         let (values, invalid) =
             list.links.get(1..).and_then(|links| links.split_at_checked(count)).ok_or_else(|| {
                 Fault::malformed(
-                    format!("a list of {count} blocks of data"),
+                    format!("a list of {count} of data", count = counted(count, "block")),
                     list.links.len().to_string().as_bytes(),
                 )
             })?;

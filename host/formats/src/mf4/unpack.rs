@@ -3,6 +3,7 @@
 use std::io::Read;
 use std::sync::Mutex;
 
+use cantap_trace::counted;
 use flate2::{Decompress, FlushDecompress, Status};
 use serde::{Deserialize, Serialize};
 
@@ -84,7 +85,7 @@ fn unpack(stored: &[u8], at: u64, len: u64, packed: Packed) -> Result<Vec<u8>, F
         _ => read_whole(lz4_flex::frame::FrameDecoder::new(stored), stored.len(), len),
     };
     if !is_whole || bytes.len() != len {
-        let found = format!("{} of {len} bytes", bytes.len());
+        let found = format!("{} of {len}", bytes.len(), len = counted(len, "byte"));
         let expected = format!("compressed data at {at:#x}");
         return Err(Fault::malformed(expected, found.as_bytes()));
     }

@@ -17,6 +17,7 @@ use super::{
     INTERFACE_DESCRIPTION, LATE, NAME_RESOLUTION, OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER,
     SIMPLE_PACKET, STATISTICS,
 };
+use cantap_trace::counted;
 use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord};
 use serde::{Deserialize, Serialize};
 
@@ -271,7 +272,7 @@ impl Decoder {
 
     #[inline]
     fn block(&mut self, kind: u32, fields: Fields) -> Result<Option<Found>, Fault> {
-        let short = || Fault::malformed("a longer block", format!("{} bytes", fields.bytes.len()).as_bytes());
+        let short = || Fault::malformed("a longer block", counted(fields.bytes.len(), "byte").as_bytes());
         match kind {
             SECTION_HEADER => {
                 self.interfaces.clear();

@@ -174,6 +174,7 @@ fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
     };
     match (count, at_least) {
         (0, true) => format!("an unknown number of frames was lost here{place}"),
+        (1, true) => format!("at least 1 frame was lost here{place}"),
         (1, false) => format!("1 frame was lost here{place}"),
         (count, true) => format!("at least {count} frames were lost here{place}"),
         (count, false) => format!("{count} frames were lost here{place}"),

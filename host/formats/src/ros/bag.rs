@@ -5,6 +5,7 @@
 #[cfg(test)]
 mod tests;
 
+use cantap_trace::counted;
 use std::collections::HashMap;
 use std::io;
 
@@ -94,7 +95,7 @@ impl Container for Bag {
         };
         let wrong = |found: String| Step::Wrong(Fault::malformed("a record of a bag", found.as_bytes()));
         if len > MAX_HELD_BYTES {
-            return Ok(wrong(format!("one with a header of {len} bytes")));
+            return Ok(wrong(format!("one with a header of {}", counted(len, "byte"))));
         }
         let Some(head) = Head::of(input.peek(len + 8)?) else { return Ok(Step::Cut) };
         let Some(op) = head.op() else { return Ok(wrong("one without its kind".to_owned())) };
@@ -142,7 +143,7 @@ impl Container for Bag {
                     }
                     Some(None) => Found::LeftOut(OTHER_MESSAGES),
                     Some(_) => {
-                        let found = format!("{} bytes", head.data_len);
+                        let found = counted(head.data_len, "byte");
                         Found::Issue(place, Fault::malformed("a message with a CAN frame", found.as_bytes()))
                     }
                     None => {

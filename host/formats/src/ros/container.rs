@@ -11,6 +11,7 @@ use super::super::input::Input;
 use super::super::issue::{Fault, Place};
 use super::nested::{self, Nested};
 use super::{Encoding, Kind, SENT_TOPIC, Topic, Topics, content};
+use cantap_trace::counted;
 use cantap_trace::{Direction, TraceRecord};
 
 /// A kind of such files.
@@ -209,7 +210,7 @@ impl<C: Container> Decoder<C> {
         };
         input.consume(head.bytes);
         let Some((bytes, is_whole)) = nested::part(input, head.len)? else {
-            let what = format!("a chunk of {} bytes", head.len);
+            let what = format!("a chunk of {}", counted(head.len, "byte"));
             return Ok(Some(Found::Issue(place, Fault::Unsupported(what.into()))));
         };
         let nested = Nested::new(bytes, head.compression, head.crc)?;
@@ -297,7 +298,9 @@ pub(super) struct Counts {
 impl Counts {
     /// What is wrong if the file says that it has others than these, which were read.
     pub(super) fn check(self, expected: Self) -> Option<Fault> {
-        let text = |Self { chunks, messages }| format!("{messages} messages in {chunks} chunks");
+        let text = |Self { chunks, messages }| {
+            format!("{} in {}", counted(messages, "message"), counted(chunks, "chunk"))
+        };
         (self != expected).then(|| {
             Fault::malformed(format!("{}, as the file's end says", text(expected)), text(self).as_bytes())
         })

@@ -6,6 +6,7 @@ use crate::issue::Fault;
 use crate::row_format::{Line, RowFormat};
 use crate::text;
 use crate::zone::Zone;
+use cantap_trace::counted;
 use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::{Direction, TraceRecord};
 
@@ -119,7 +120,7 @@ impl Decoder {
         };
         let is_fd = kind == Kind::FdFrame;
         if !is_fd && !fields.error && data.len() < usize::from(fields.len.min(8)) {
-            let found = format!("{} bytes", data.len());
+            let found = counted(data.len(), "byte");
             return Err(Fault::malformed(format!("{} data bytes", fields.len), found.as_bytes()));
         }
         let message = Message {

@@ -5,6 +5,7 @@
 #[cfg(test)]
 mod tests;
 
+use cantap_trace::counted;
 use std::collections::HashMap;
 use std::io;
 
@@ -205,7 +206,7 @@ impl Mcap {
                 };
                 let found = match other {
                     Some(None) => Found::LeftOut(OTHER_MESSAGES),
-                    Some(_) => issue("a message with a CAN frame", format!("{len} bytes")),
+                    Some(_) => issue("a message with a CAN frame", counted(len, "byte")),
                     None => issue("a message of a channel of the file", format!("channel {number}")),
                 };
                 let is_whole = skip(input, len.saturating_add(HEAD_BYTES as u64))?;

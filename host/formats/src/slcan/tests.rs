@@ -72,7 +72,7 @@ fn a_terminals_clock_is_the_time_and_reports_are_events() {
     let events: Vec<_> = records.iter().map(|record| record.event.to_string()).collect();
     assert_eq!(
         events[1..4],
-        ["at least 1 frames lost (unknown)", "bus error: crc", "controller passive, counters 130 / 0"]
+        ["at least 1 frame lost (unknown)", "bus error: crc", "controller passive, counters 130 / 0"]
     );
     assert_eq!((issues, counted), (vec![], vec![(super::OTHERS, 2), (super::REFUSED, 1)]));
 }

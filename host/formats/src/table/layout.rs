@@ -1,5 +1,7 @@
 //! Where in a row of a table everything is.
 
+use cantap_trace::counted;
+
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
 use super::columns::{Column, Columns, Form, ROLES, Role, kind_of, role_of};
@@ -182,7 +184,7 @@ impl Layout {
         for (role, place) in ROLES.iter().zip(&mut layout.places) {
             let Some(place) = place else { continue };
             let Some(column) = typed.get(place.at) else {
-                let found = format!("{} columns", typed.len());
+                let found = counted(typed.len(), "column");
                 return Err(Fault::malformed(format!("a column {}", place.at + 1), found.as_bytes()));
             };
             let of_type = match (role.1, column.form) {

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use cantap_can::{Frame, Id};
 use cantap_trace::clean;
+use cantap_trace::counted;
 
 use super::checksums::{Algorithm, Checksum, Part};
 use super::counters::{Counter, Field};
@@ -70,7 +71,9 @@ impl Model {
             line(
                 &mut out,
                 &format!(
-                    "// Left out, because there are too many: {identifiers} identifiers with {frames} frames."
+                    "// Left out, because there are too many: {identifiers} with {frames}.",
+                    identifiers = counted(identifiers, "identifier"),
+                    frames = counted(frames, "frame")
                 ),
             );
         }
@@ -102,8 +105,8 @@ impl Model {
         for exchange in &self.exchanges {
             let _ = write!(
                 out,
-                "\n// {} requests by {}.\n",
-                exchange.asked.len(),
+                "\n// {} by {}.\n",
+                counted(exchange.asked.len(), "request"),
                 named(exchange.channel, &exchange.requests, names)
             );
             let asked = &exchange.asked;
@@ -236,9 +239,9 @@ fn periodic(out: &mut String, stream: &Stream, period: Period, until_ns: Option<
     if content.steps.len() < content.all_steps {
         let _ = writeln!(
             out,
-            "    // {} of {} steps, in rows from all over the trace.",
+            "    // {} of {}, in rows from all over the trace.",
             content.steps.len(),
-            content.all_steps
+            counted(content.all_steps, "step")
         );
     }
     if as_frames {

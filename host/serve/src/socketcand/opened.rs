@@ -2,6 +2,7 @@
 
 use std::collections::HashMap;
 
+use cantap_trace::counted;
 use cantap_wire::message::Periodic;
 use cantap_wire::{Frame, Id};
 
@@ -60,7 +61,7 @@ impl Connection {
             None => (0..hello.periodic_slots)
                 .find(|slot| periodic.values().all(|(taken, _)| taken != slot))
                 .ok_or_else(|| {
-                    format!("the board sends at most {} frames periodically", hello.periodic_slots)
+                    format!("the board sends at most {} periodically", counted(hello.periodic_slots, "frame"))
                 })?,
         };
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };

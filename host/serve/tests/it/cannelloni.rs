@@ -169,7 +169,7 @@ fn a_datagram_that_comes_twice_is_sent_once_and_what_is_wrong_with_one_is_report
     hiding[4] = 1;
     far.peer.send(&hiding).unwrap();
     far.tells(
-        "3 datagrams before this one are missing; 10 bytes follow the frames that a datagram says it has",
+        "3 datagrams before this one are missing; 10 bytes behind the frames that a datagram says it has",
     );
     assert_eq!(seen.next().unwrap(), "125#");
     let mut cut = with(6, &["128#", "129#"]);
@@ -183,7 +183,7 @@ fn a_datagram_that_comes_twice_is_sent_once_and_what_is_wrong_with_one_is_report
 fn a_peer_that_may_only_listen_sends_nothing() {
     let far = tunnel(Role::Listen);
     far.peer.send(&with(0, &["123#11"])).unwrap();
-    far.tells("1 frames were not sent: it may only listen");
+    far.tells("not sent: 1 frame: it may only listen");
     assert!(far.board.clients() == 1);
 }
 

@@ -8,6 +8,8 @@ pub mod usb;
 
 use std::time::Duration;
 
+use cantap_trace::counted;
+
 pub use layout::{Layout, Sector};
 
 /// What a [`Port`] reports.
@@ -159,7 +161,9 @@ impl<P: Port> Dfu<'_, P> {
     fn status(&mut self) -> Result<Status, DfuError> {
         let answer = self.port.receive(GETSTATUS, 0, 6).map_err(DfuError::Port)?;
         let [status, low, middle, high, state, ..] = answer[..] else {
-            return Err(DfuError::Port(format!("{} bytes of status instead of 6", answer.len()).into()));
+            return Err(DfuError::Port(
+                format!("{} of status instead of 6", counted(answer.len(), "byte")).into(),
+            ));
         };
         let poll = Duration::from_millis(u32::from_le_bytes([low, middle, high, 0]).into());
         Ok(Status { code: status, poll, state })

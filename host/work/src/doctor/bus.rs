@@ -6,6 +6,7 @@ use cantap::Channel;
 use cantap::autobaud::{Limits, Outcome as Measured};
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap_address::OpenDevice;
+use cantap_trace::counted;
 
 use super::check::{BusFigures, Check, Examination, Verdict, channels, is_stopped};
 use crate::bit_rate_search::{self, Search};
@@ -240,9 +241,13 @@ impl Received {
             .map_or_else(String::new, |load| format!(", load {} %", rounded(load, 1)));
         let errors = match self.evidence.errors() {
             0 => "no errors".to_owned(),
-            count => format!("{count} errors ({})", self.evidence.errors_text()),
+            count => format!("{count} ({})", self.evidence.errors_text(), count = counted(count, "error")),
         };
-        let text = format!("{} frames at {} bit/s{load}, {errors}", self.evidence.frames(), self.bitrate_bps);
+        let text = format!(
+            "{} at {} bit/s{load}, {errors}",
+            counted(self.evidence.frames(), "frame"),
+            self.bitrate_bps
+        );
         self.check(Verdict::Ok, None, text)
     }
 
@@ -250,7 +255,12 @@ impl Received {
         let figures = match (self.evidence.frames(), self.evidence.errors()) {
             (_, 0) => String::new(),
             (frames, errors) => {
-                format!(" ({frames} frames, {errors} errors: {})", self.evidence.errors_text())
+                format!(
+                    " ({frames}, {errors}: {})",
+                    self.evidence.errors_text(),
+                    frames = counted(frames, "frame"),
+                    errors = counted(errors, "error")
+                )
             }
         };
         let found = format!("at {} bit/s {}{figures}", self.bitrate_bps, hint.meaning());

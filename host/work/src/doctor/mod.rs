@@ -7,6 +7,7 @@ mod port;
 
 use cantap::wire::message::{Failures, Hello, capability};
 use cantap_address::OpenDevice;
+use cantap_trace::counted;
 
 pub use self::check::{BusFigures, Check, Examination, Verdict};
 use crate::advice;
@@ -91,8 +92,9 @@ fn of_failures(about: &str, hello: &Hello, failures: &Failures) -> Check {
         count => Check::note(
             "device",
             format!(
-                "{about}; its firmware has failed {count} times since power-on, the last time: {}",
-                failures.last
+                "{about}; its firmware has failed {count} since power-on, the last time: {}",
+                failures.last,
+                count = counted(count, "time")
             ),
             "report it with the output of `cantap status --registers`",
         ),

@@ -17,7 +17,7 @@ use ratatui::widgets::{Block, Borders, Paragraph, Wrap};
 
 use super::super::app::{App, Drawn};
 use super::super::cut::{cut_line, draw_lines};
-use super::super::model::{Seen, Series, SignalRow};
+use super::super::model::{History, Seen, Series, SignalRow};
 use super::super::times::clock;
 use super::signals::short;
 use axis::GUTTER;
@@ -39,6 +39,7 @@ struct Chosen<'a> {
 /// What all panes have in common.
 struct Page<'a> {
     app: &'a App,
+    history: &'a History,
     seen: &'a Seen,
     /// The columns of the curves; each pane has its own rows.
     columns: Rect,
@@ -61,7 +62,7 @@ fn name(row: &SignalRow, seen: &Seen) -> String {
 }
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, history: &History, seen: &Seen) {
     let chosen = seen.signals.rows().iter().filter_map(|row| Some((row, row.series.as_ref()?)));
     let (digital, analogue): (Vec<_>, Vec<_>) = chosen.partition(|(row, _)| is_digital(row, seen));
     if digital.is_empty() && analogue.is_empty() {
@@ -101,7 +102,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
         oldest_ns: oldest,
         now_ns: seen.now_ns,
     };
-    let page = Page { app, seen, columns, from_ns };
+    let page = Page { app, history, seen, columns, from_ns };
     for ((label, rows), area) in panes.iter().zip(areas.iter()) {
         page.analogue(frame, *area, label, rows);
     }
@@ -303,8 +304,9 @@ impl Page<'_> {
             let _ = write!(text, "  {name} {}", clock(at, 6));
         }
         if let [Some(first), Some(second)] = graph.cursors {
-            let between = second.saturating_sub(first) as f64 / 1e9;
-            let _ = write!(text, "  Δt {between:.6} s");
+            let between = self.history.interval(first, second);
+            let clock = if between.by_device { " by the device's clock" } else { "" };
+            let _ = write!(text, "  Δt {:.6} s{clock}", between.ns as f64 / 1e9);
         }
         let mut spans = vec![Span::styled(text, theme.label())];
         if let Some(oldest_ns) = not_kept {

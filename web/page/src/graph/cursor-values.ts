@@ -1,5 +1,6 @@
-// The exact values at the two cursors. What is drawn is thinned to columns; these are asked for one by one.
+// The exact values at the two cursors, and how far they are apart. What is drawn is thinned to columns; these are asked for one by one.
 
+import type { Interval } from '../api';
 import type { App } from '../model/app';
 import { Latest } from '../model/latest';
 import type { Item } from '../model/panels';
@@ -13,14 +14,33 @@ interface Entry {
 
 export class CursorValues {
   readonly #entries = new Map<string, Entry>();
+  readonly #asking: Latest<{ from: number; to: number }>;
+  #interval: { from: number; to: number; answer: Interval } | null = null;
 
   constructor(
     private readonly app: App,
     private readonly arrived: () => void,
-  ) {}
+  ) {
+    this.#asking = new Latest(
+      async ({ from, to }) => {
+        this.#interval = { from, to, answer: await app.ask('interval', { from, to }) };
+        this.arrived();
+      },
+      () => undefined,
+    );
+  }
 
   clear(): void {
+    this.#interval = null;
     this.#entries.clear();
+  }
+
+  /** From cursor A to B; null until it is known. */
+  interval(from: number, to: number): Interval | null {
+    const known = this.#interval;
+    if (known?.from === from && known.to === to) return known.answer;
+    this.#asking.ask({ from, to });
+    return null;
   }
 
   /** The value that holds at the cursor: null before the first, undefined until it is known (and for bus load, which has no single values). */

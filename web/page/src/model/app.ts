@@ -7,7 +7,7 @@ import type { Connection } from '../live/connection';
 import type { Source } from '../live/source';
 import { Emitter } from './emitter';
 import { pieces } from './files';
-import { count, seconds } from './format';
+import { count, plural, seconds } from './format';
 import { History } from './history';
 import { Panels } from './panels';
 import type { Report } from './report';
@@ -15,6 +15,8 @@ import { Spacing } from './spacing';
 import { type Profile, Storage } from './storage';
 
 /** `steady` comes with `summary`, but of a trace that grows live only about once a second: for what is costly, or is read and not watched. */
+const SEVERITIES = ['error', 'warning', 'info'];
+
 export type Topic = 'live' | 'board' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
 
 export interface Range {
@@ -209,7 +211,7 @@ export class App extends Emitter<Topic> {
     }
     for (const { channel, bitrate, dataBitrate } of bitrates) await this.ask('bitrate', { channel, bitrate, ...(dataBitrate === null ? {} : { dataBitrate }) });
     await this.refresh();
-    for (const issue of this.summary?.issues ?? []) this.notify('warning', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`);
+    for (const issue of this.summary?.issues ?? []) this.notify('warning', `${issue.text}${issue.count > 1 ? ` (${plural(issue.count, 'time')})` : ''}`);
   }
 
   /** A live source that has sent nothing yet: an empty trace, in which the views wait. */
@@ -347,12 +349,14 @@ export class App extends Emitter<Topic> {
     }
   }
 
+  /** Those of the report and those of the engine, the worst first. */
   #joined(findings: Finding[]): Finding[] {
     const seen = new Set<string>();
-    return [...(this.report?.findings ?? []), ...findings].filter((f) => {
+    const all = [...(this.report?.findings ?? []), ...findings].filter((f) => {
       const key = `${f.time} ${f.text}`;
       return seen.has(key) ? false : (seen.add(key), true);
     });
+    return all.sort((a, b) => SEVERITIES.indexOf(a.severity) - SEVERITIES.indexOf(b.severity));
   }
 
   async addDatabase(name: string, bytes: Uint8Array, channel: number | null): Promise<void> {

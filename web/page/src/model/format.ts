@@ -1,5 +1,7 @@
 // Numbers, times and identifiers as they are shown. Every number that has a unit is shown with it.
 
+import type { Summary } from '../api';
+
 const SEPARATOR = ' '; // narrow blank that does not break
 
 /** 1234567 → `1 234 567`. */
@@ -46,6 +48,12 @@ export function duration(value: number): string {
   const m = Math.floor((whole % 3600) / 60);
   const s = whole % 60;
   return h > 0 ? `${sign}${h} h ${pad2(m)} min ${pad2(s)} s` : `${sign}${m} min ${pad2(s)} s`;
+}
+
+/** Whose clock measured an interval, if the trace has two: what the device counted differs from UTC, which is corrected now and then. */
+export function clock(byDevice: boolean, summary: Pick<Summary, 'deviceTimes'> | null): string {
+  if (byDevice) return 'by the device’s clock';
+  return summary?.deviceTimes ? 'by UTC' : '';
 }
 
 /** At most five significant digits, without trailing zeros. */

@@ -131,7 +131,7 @@ export class BitsView implements View {
     const heat = flips === 0 ? 0 : Math.max(1, Math.ceil(Math.sqrt(share) * 9));
     // A bit that is always 1 is not one that changed once.
     const shown = flips === 0 ? (ones > 0 ? '=1' : '=0') : shortCount(flips);
-    const element = el('span', { class: `bit heat${heat}`, id: `bit-${cell}`, attrs: { role: 'gridcell', 'aria-label': `${shown}, byte ${cell >> 3} bit ${bitOfCell(cell) & 7}: ${flips} changes, 1 in ${ones} of ${bits.frames} frames` } }, shown);
+    const element = el('span', { class: `bit heat${heat}`, id: `bit-${cell}`, attrs: { role: 'gridcell', 'aria-label': `${shown}, byte ${cell >> 3} bit ${bitOfCell(cell) & 7}: ${plural(flips, 'change')}, 1 in ${ones} of ${plural(bits.frames, 'frame')}` } }, shown);
     element.dataset['cell'] = String(cell);
     let depth = 0;
     for (const [i, cells] of places.entries()) {

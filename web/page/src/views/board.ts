@@ -2,7 +2,7 @@
 
 import type { Board } from '../live/board';
 import type { App } from '../model/app';
-import { bitrate, count } from '../model/format';
+import { bitrate, count, plural } from '../model/format';
 import { button, el, replace, setText } from '../ui/dom';
 import { openBoard } from './open-board';
 import type { View } from './view';
@@ -55,7 +55,7 @@ export class BoardView implements View {
     const { board: state, isOpen } = board;
     // Another trace may have taken the place of the board's.
     const isShown = app.live === board;
-    setText(this.#connection, !isOpen ? board.reason : board.status === 'open' ? `Open, and only listening. ${count(board.next)} records received.` : 'Waiting for the board’s answer …');
+    setText(this.#connection, !isOpen ? board.reason : board.status === 'open' ? `Open, and only listening. ${plural(board.next, 'record')} received.` : 'Waiting for the board’s answer …');
     this.#connection.classList.toggle('bad', board.status === 'lost');
     this.#close.hidden = !isOpen;
     this.#new.hidden = isOpen;
@@ -75,7 +75,7 @@ export class BoardView implements View {
     setText(this.#law, !ended ? 'The board’s count is up to a second old.' : agree ? 'Received and lost together are what the board has counted.' : 'The counts do not agree: frames are missing that nobody has named.');
     this.#law.classList.toggle('bad', ended && !agree);
     this.#damaged.hidden = state.corrupt === 0;
-    setText(this.#damaged, `${count(state.corrupt)} messages were damaged on their way; what they held is counted as lost, where it is known. Try another cable or port.`);
+    setText(this.#damaged, `Damaged on their way: ${plural(state.corrupt, 'message')}; what they held is counted as lost, where it is known. Try another cable or port.`);
   }
 }
 

@@ -2,7 +2,7 @@
 
 import type { ProtocolEvent } from '../api';
 import type { App } from '../model/app';
-import { count, duration, seconds } from '../model/format';
+import { clock, count, duration, plural, seconds } from '../model/format';
 import { Latest } from '../model/latest';
 import type { Commands } from '../ui/commands';
 import { el, select, setText, svg } from '../ui/dom';
@@ -147,9 +147,16 @@ export class ConversationsView implements View {
       }),
     );
     const left = this.#total - this.#events.length;
-    setText(this.#state, `${count(this.#shown.length)} of ${count(this.#total)} events${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}`);
+    setText(this.#state, `${count(this.#shown.length)} of ${plural(this.#total, 'event')}${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}${this.#clock()}`);
     this.#list.refresh();
     this.#ladder.refresh();
+  }
+
+  /** Whose clock measured how long they took. */
+  #clock(): string {
+    const long = this.#shown.filter((event) => event.end > event.time);
+    const by = long.length > 0 ? clock(long.every((event) => event.took.byDevice), this.app.summary) : '';
+    return by && `, measured ${by}`;
   }
 
   #laneX(i: number): number {
@@ -166,7 +173,7 @@ export class ConversationsView implements View {
     const event = this.#shown[index];
     if (!event) return false;
     row.classList.toggle('failed', event.failed);
-    const texts = [seconds(event.time), event.end > event.time ? duration(event.end - event.time) : '', String(event.channel), event.protocol, event.kind, event.from, event.to, event.text];
+    const texts = [seconds(event.time), event.end > event.time ? duration(event.took.seconds) : '', String(event.channel), event.protocol, event.kind, event.from, event.to, event.text];
     for (const [i, text] of texts.entries()) setText(cells[i] as HTMLElement, text);
     return true;
   }
@@ -177,7 +184,7 @@ export class ConversationsView implements View {
     row.classList.toggle('failed', event.failed);
     const [time, rung, what] = cells as [HTMLElement, HTMLElement, HTMLElement];
     setText(time, seconds(event.time));
-    setText(what, `${event.kind}: ${event.text}${event.end > event.time ? ` (${duration(event.end - event.time)})` : ''}`);
+    setText(what, `${event.kind}: ${event.text}${event.end > event.time ? ` (${duration(event.took.seconds)})` : ''}`);
     const key = `${index} ${event.time} ${event.from} ${event.to} ${this.#parties.length}`;
     if (rung.dataset['key'] === key) return true;
     rung.dataset['key'] = key;

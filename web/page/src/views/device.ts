@@ -143,7 +143,7 @@ export class DeviceView implements View {
     const { live } = this;
     const { state } = live;
     const behind = live.latest - live.next;
-    setText(this.#connection, live.status === 'open' ? `Connected. ${count(live.next)} records received${behind > 0 ? `, ${count(behind)} behind` : ''}.${state && state.pages > 1 ? ` ${plural(state.pages, 'page')} are open.` : ''}` : live.reason || 'Connecting …');
+    setText(this.#connection, live.status === 'open' ? `Connected. ${plural(live.next, 'record')} received${behind > 0 ? `, ${count(behind)} behind` : ''}.${state && state.pages > 1 ? ` ${plural(state.pages, 'page')} are open.` : ''}` : live.reason || 'Connecting …');
     this.#connection.classList.toggle('bad', live.status === 'lost' || live.status === 'ended');
     if (!state) return;
     this.#recorder.hidden = !state.mayRecord;

@@ -2,7 +2,7 @@
 
 import type { IdRow } from '../api';
 import { type App, type Identifier, sameIdentifier } from '../model/app';
-import { bytesText, count, idText, seconds } from '../model/format';
+import { bytesText, clock, count, idText, plural, seconds } from '../model/format';
 import { Latest } from '../model/latest';
 import { Spacing } from '../model/spacing';
 import type { Commands } from '../ui/commands';
@@ -142,7 +142,7 @@ export class FixedView implements View {
     };
     rows.sort(by[this.#order]);
     this.#lines = rows.flatMap((row): Line[] => [{ kind: 'id', row }, ...(this.#open.has(keyOf(row)) ? row.signals.map((_, signal): Line => ({ kind: 'signal', row, signal })) : [])]);
-    setText(this.#state, `${count(rows.length)} identifiers at ${seconds(this.#time)} s`);
+    setText(this.#state, `${plural(rows.length, 'identifier')} at ${seconds(this.#time)} s`);
     this.#list.refresh();
   }
 
@@ -183,6 +183,8 @@ export class FixedView implements View {
     const open = this.#open.has(keyOf(id));
     const texts = [id.signals.length > 0 ? (open ? '▾' : '▸') : '', String(id.channel), idText(id.id, id.extended), id.message ?? '', count(id.count), ...[id.period?.median, id.period?.min, id.period?.max].map(milliseconds), seconds(id.lastTime)];
     for (const [i, text] of texts.entries()) setText(cells[i] as HTMLElement, text);
+    const by = id.period ? clock(id.period.byDevice, this.app.summary) : '';
+    for (const cell of cells.slice(5, 8)) cell.title = by && `Measured ${by}`;
     row.setAttribute('aria-level', '1');
     if (id.signals.length > 0) row.setAttribute('aria-expanded', String(open));
     else row.removeAttribute('aria-expanded');

@@ -1,7 +1,7 @@
 // Graphs of signals and of bus load: panels one above the other over one axis of time.
 
 import type { App } from '../model/app';
-import { duration, quantity, seconds } from '../model/format';
+import { clock, duration, quantity, seconds } from '../model/format';
 import { type Item, type Panel, itemLabel, itemTexts, itemUnit } from '../model/panels';
 import type { Commands } from '../ui/commands';
 import { button, el, replace, select, setText } from '../ui/dom';
@@ -341,7 +341,8 @@ export class GraphsView implements View {
     if (this.#hover !== null) parts.push(`at ${seconds(this.#hover)} s`);
     if (cursorA !== null) parts.push(`A ${seconds(cursorA)} s`);
     if (cursorB !== null) parts.push(`B ${seconds(cursorB)} s`);
-    if (cursorA !== null && cursorB !== null && cursorA !== cursorB) parts.push(`Δt ${duration(cursorB - cursorA)} (${quantity(1 / Math.abs(cursorB - cursorA), 'Hz', 7)})`);
+    const apart = cursorA !== null && cursorB !== null && cursorA !== cursorB ? this.#exact.interval(cursorA, cursorB) : null;
+    if (apart) parts.push(`Δt ${seconds(apart.seconds)} s (${quantity(1 / Math.abs(apart.seconds), 'Hz', 7)}) ${clock(apart.byDevice, this.app.summary)}`.trim());
     setText(this.#state, parts.join('   '));
   }
 

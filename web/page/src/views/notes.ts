@@ -58,7 +58,8 @@ export class NotesView implements View {
 
   #draw(): void {
     const { notes } = this.app;
-    replace(this.#list, ...notes.map((note) => this.#entry(note)), notes.length === 0 ? el('li', { class: 'muted empty' }, 'No notes yet. Ctrl+B adds one at cursor A.') : null);
+    const ofReport = (this.app.report?.notes ?? []).map((text) => el('li', {}, el('span', { class: 'muted' }, 'of the report'), el('span', { class: 'note-text' }, text)));
+    replace(this.#list, ...ofReport, ...notes.map((note) => this.#entry(note)), notes.length === 0 ? el('li', { class: 'muted empty' }, 'No notes yet. Ctrl+B adds one at cursor A.') : null);
   }
 
   #entry(note: Note): HTMLElement {

@@ -5,7 +5,7 @@ import type { BitGrid, SignalEdit, SignalInfo } from '../api';
 import type { App, Identifier } from '../model/app';
 import { type BitField, cellsOf } from '../model/bit-layout';
 import { save } from '../model/files';
-import { count, idText, quantity } from '../model/format';
+import { idText, plural, quantity } from '../model/format';
 import { Latest } from '../model/latest';
 import { button, el, field, setText } from '../ui/dom';
 import { readColours } from '../graph/colours';
@@ -166,7 +166,7 @@ export class SignalEditor {
       low = Math.min(low, series.min[i] as number);
       high = Math.max(high, series.max[i] as number);
     }
-    setText(this.#range, Number.isFinite(low) ? `${quantity(low, edit.unit)} … ${quantity(high, edit.unit)}, ${count(series.values)} values` : 'no value in this trace');
+    setText(this.#range, Number.isFinite(low) ? `${quantity(low, edit.unit)} … ${quantity(high, edit.unit)}, ${plural(series.values, 'value')}` : 'no value in this trace');
   }
 
   #drawOnly(): void {

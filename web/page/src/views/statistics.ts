@@ -2,7 +2,7 @@
 
 import type { Answer } from '../api';
 import type { App } from '../model/app';
-import { count, duration, idText, percent } from '../model/format';
+import { clock, count, duration, idText, percent } from '../model/format';
 import type { Commands } from '../ui/commands';
 import { el, replace } from '../ui/dom';
 import { readColours } from '../graph/colours';
@@ -50,6 +50,7 @@ export class StatisticsView implements View {
     this.#periods = periods;
     const total = periods.counts.reduce((sum, n) => sum + n, 0);
     const name = idText(chosen.id, chosen.extended);
+    const by = clock(periods.byDevice, this.app.summary);
     const frames = this.#chosen.picker.row?.count;
     replace(
       this.#figures,
@@ -63,6 +64,7 @@ export class StatisticsView implements View {
             ['Smallest', duration(periods.min)],
             ['Largest', duration(periods.max)],
             ['Standard deviation', duration(periods.deviation)],
+            ...(by ? [['Measured', by] as [string, string]] : []),
           ]),
     );
     this.#canvas.setAttribute('aria-label', `Histogram of the periods of ${name}: the numbers stand below`);

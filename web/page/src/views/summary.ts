@@ -54,7 +54,7 @@ export class SummaryView implements View {
       ['Records', count(summary.records + summary.forgotten)],
       ...(summary.forgotten > 0 ? [['Kept', `the newest ${count(summary.records)}, from ${seconds(summary.begin)} s on`] as [string, string]] : []),
       ...(summary.growing ? [['Read', summary.progress === null ? 'live' : percent(summary.progress)] as [string, string]] : []),
-      ...summary.issues.map((issue): [string, string] => ['Not read', `${issue.text}${issue.count > 1 ? ` (${count(issue.count)} times)` : ''}`]),
+      ...summary.issues.map((issue): [string, string] => ['Not read', `${issue.text}${issue.count > 1 ? ` (${plural(issue.count, 'time')})` : ''}`]),
     ];
   }
 
@@ -138,7 +138,7 @@ export class SummaryView implements View {
     return el(
       'div',
       { class: 'report-facts' },
-      report.created || report.command ? el('p', { class: 'muted' }, [report.created, report.command].filter(Boolean).join(' · ')) : null,
+      report.created || report.command ? el('p', { class: 'muted' }, [report.created.replace(/^(\S+)T(\S+)Z$/, 'made $1 $2 UTC'), report.command].filter(Boolean).join(' · ')) : null,
       ...report.notes.map((text) => el('p', { class: 'report-note' }, text)),
       ...report.thinned.map((text) => el('p', { class: 'bad' }, text)),
       button('Save the trace', () => void this.#saveTrace(), { title: 'The file as it was, byte for byte' }),

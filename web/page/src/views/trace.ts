@@ -2,7 +2,7 @@
 
 import type { Row, SignalValue } from '../api';
 import type { App } from '../model/app';
-import { bytesText, count, idText, seconds, utc } from '../model/format';
+import { bytesText, clock, count, idText, plural, seconds, utc } from '../model/format';
 import { Latest } from '../model/latest';
 import { RowCache } from '../model/row-cache';
 import type { Commands } from '../ui/commands';
@@ -173,7 +173,7 @@ export class TraceView implements View {
     const changed = text !== this.#applied || moved;
     this.#applied = text;
     this.#ready = true;
-    setText(this.#state, text.trim() === '' ? `${count(rows)} records` : `${count(rows)} of ${count(this.app.summary.records)} records`);
+    setText(this.#state, text.trim() === '' ? plural(rows, 'record') : `${count(rows)} of ${plural(this.app.summary.records, 'record')}`);
     this.#state.classList.remove('bad');
     this.list.refresh();
     if (changed && anchor && rows > 0 && !this.#follow) this.list.select((await this.app.ask('rowAt', { view, time: anchor.time })).row);
@@ -216,7 +216,7 @@ export class TraceView implements View {
       return false;
     }
     setText(no, count(record.index + 1));
-    setText(time, this.#timeText(record, index));
+    setText(time, this.#timeText(record));
     time.classList.toggle('late', record.late);
     time.title = record.late ? 'Late stamp: the frame ended no later than this' : '';
     setText(channel, record.channel === null ? '' : String(record.channel));
@@ -229,13 +229,12 @@ export class TraceView implements View {
     return true;
   }
 
-  #timeText(record: Row, index: number): string {
+  #timeText(record: Row): string {
     const mark = record.late ? '≤' : '';
     const style = this.app.profile.timeStyle;
     if (style === 'absolute' && this.app.summary?.startUtcNs) return mark + utc(this.app.summary.startUtcNs, record.time).slice(11);
     if (style === 'delta') {
-      const above = index > 0 ? this.#cache.get(index - 1) : null;
-      return mark + (above ? `+${(record.time - above.time).toFixed(6)}` : seconds(record.time));
+      return mark + (record.above ? `${record.above.seconds < 0 ? '−' : '+'}${Math.abs(record.above.seconds).toFixed(6)}` : seconds(record.time));
     }
     return mark + seconds(record.time);
   }
@@ -275,6 +274,7 @@ export class TraceView implements View {
       ['Record', `${count(row.index + 1)} of ${count((this.app.summary?.records ?? 0) + (this.app.summary?.forgotten ?? 0))}`],
       ['Time', `${row.late ? '≤ ' : ''}${seconds(row.time)} s`],
       ...(start ? [['UTC', utc(start, row.time)] as [string, string]] : []),
+      ...(row.above ? [['Since the row above', `${row.above.seconds.toFixed(6)} s ${clock(row.above.byDevice, this.app.summary)}`.trim()] as [string, string]] : []),
       ...(row.late ? [['Stamp', 'late: the frame ended no later than this'] as [string, string]] : []),
       ...(row.channel === null ? [] : [['Channel', String(row.channel)] as [string, string]]),
       ...(row.id === null ? [] : [['Identifier', `${idText(row.id, row.extended)}, ${row.extended ? '29' : '11'} bit${row.sent ? ', sent' : ''}`] as [string, string]]),

@@ -126,7 +126,7 @@ fn a_frame_whose_bytes_are_missing_does_not_take_the_others_with_it() {
     let (records, issues) = tests::read(Format::Mf4, &file);
     let frames = records.iter().filter(|record| record.frame().is_some()).count();
     assert_eq!(frames, FRAMES.len() - 1);
-    assert!(issues.len() == 1 && issues[0].contains("1 frames without theirs, the first at"), "{issues:?}");
+    assert!(issues.len() == 1 && issues[0].contains("1 frame without theirs, the first at"), "{issues:?}");
 }
 
 /// `cat a.mf4 b.mf4` gave the first one, and nothing was said of the second.

@@ -7,6 +7,7 @@ use cantap::Channel;
 use cantap::wire::Id;
 use cantap::wire::message::{Filter, FrameKind, GatewayRule, Modifier, Pass};
 use cantap_trace::clean;
+use cantap_trace::counted;
 use cantap_trace::filter::{EXTENDED, IdFilter, REMOTE};
 use cantap_trace::grammar::{self, IdPattern};
 use serde::Deserialize;
@@ -133,12 +134,12 @@ fn rule(source: &Source, span: &Range<usize>, entry: &Entry) -> Result<Rule, Rul
     }
     for (field, text) in [("counter", &entry.counter), ("period", &entry.period)] {
         if let Some(text) = text.as_ref().filter(|_| filters.len() > 1) {
-            let parts = filters.len();
+            let parts = counted(filters.len(), "place");
             return Err(source.fault(
                 &text.span(),
                 field,
                 format!(
-                    "it is one for all frames of the rule, whose filter takes {parts} places in a device; write a rule for each \
+                    "it is one for all frames of the rule, whose filter takes {parts} in a device; write a rule for each \
                      identifier, or a filter with a mask or ? (8 digits for 29 bits)"
                 ),
             ));

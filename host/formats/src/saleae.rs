@@ -10,7 +10,7 @@ use super::row_format::{Line, RowFormat};
 use super::table::{date, split_cells};
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
-use cantap_trace::{Direction, TraceRecord};
+use cantap_trace::{Direction, TraceRecord, counted};
 
 const OTHERS: &str = "what other analysers decoded, and fields of no frame";
 const ERRORS: &str = "errors that the analyser saw, of which the table does not say enough";
@@ -90,7 +90,7 @@ impl Open {
         let found = || format!("{} of them", self.bytes.len());
         let code = match self.len {
             Some(code) if code <= 15 && (self.remote || self.bytes.len() == code.min(8)) => code,
-            Some(code) => return Err(Fault::malformed(format!("{code} data bytes"), found().as_bytes())),
+            Some(code) => return Err(Fault::malformed(counted(code, "data byte"), found().as_bytes())),
             None if self.remote => return Err(Fault::malformed("a frame's length", b"none")),
             // The column of lengths was not chosen.
             None => self.bytes.len(),

@@ -363,7 +363,7 @@ impl Decoder {
             };
             if let Some(len) = len.filter(|len| !fits(*len)) {
                 let found = counted(bytes.len(), "byte");
-                return Err(Fault::malformed(format!("{len} data bytes"), found.as_bytes()));
+                return Err(Fault::malformed(counted(len, "data byte"), found.as_bytes()));
             }
         } else if let Some(first) = layout.place(Role::Bytes) {
             let columns = cells.iter().skip(first.at).take(layout.byte_columns);

@@ -14,9 +14,10 @@ use cantap_protocols::active::Machine as _;
 use cantap_protocols::active::exchange::{Exchange, ServerAnswer};
 use cantap_protocols::diagnostics::Diagnostics;
 use cantap_protocols::{Assembler as _, Event};
+use cantap_trace::counted;
 
 use super::{Vehicle, is_answer};
-use crate::terms::{counted, failure_text};
+use crate::terms::failure_text;
 use crate::uds::TransferOptions;
 
 /// The tag of our frames: the scripts' are below.

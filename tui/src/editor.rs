@@ -2,14 +2,14 @@
 
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus};
-use std::time::Duration;
 
 use cantap_work::interrupt;
 
 use super::stops::Stops;
 
 /// How often to look whether the editor has ended.
-const LOOK_EVERY: Duration = Duration::from_millis(30);
+#[cfg(unix)]
+const LOOK_EVERY: std::time::Duration = std::time::Duration::from_millis(30);
 
 /// How editing ended.
 pub enum Edited {

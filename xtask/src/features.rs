@@ -28,7 +28,7 @@ pub fn check(shell: &Shell) -> Result<()> {
 }
 
 /// Runs it; a warning about one of our crates is an error. (As a flag of the compiler, that would compile other people's crates again.)
-fn without_warning(check: Cmd<'_>) -> Result<()> {
+pub fn without_warning(check: Cmd<'_>) -> Result<()> {
     let name = check.to_string();
     let output = check.ignore_status().output()?;
     let text = String::from_utf8_lossy(&output.stderr);

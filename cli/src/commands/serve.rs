@@ -25,7 +25,9 @@ use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
 use cantap_address::server::PORT;
 use cantap_address::{Address, LinkError};
-use cantap_serve::listen::{self, Listening};
+#[cfg(unix)]
+use cantap_serve::listen;
+use cantap_serve::listen::Listening;
 #[cfg(unix)]
 use cantap_serve::socket_file::{self, SocketError};
 use cantap_serve::{Board, BoardError, News, Role, Settings, connect};

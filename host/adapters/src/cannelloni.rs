@@ -3,7 +3,7 @@
 //! There is no time in its datagrams, and UDP may lose or reorder them.
 
 use std::io;
-use std::net::UdpSocket;
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, ToSocketAddrs as _, UdpSocket};
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
@@ -36,14 +36,20 @@ pub(crate) struct Cannelloni {
 impl Cannelloni {
     /// A tunnel to `HOST:PORT`, whose other end sends to `listen` here.
     pub fn connect(place: &str, listen: u16, address: &str) -> Result<Self, OpenError> {
-        Self::try_connect(place, listen)
-            .map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })
+        Self::try_connect(place, listen).map_err(|source| {
+            let address = address.to_owned();
+            if source.kind() == io::ErrorKind::AddrInUse {
+                let reason = format!(
+                    "another program has UDP port {listen} of this computer; end it, or have the other end send to another port and give that as ?listen=PORT"
+                );
+                return OpenError::Channel { address, reason };
+            }
+            OpenError::Unreachable { address, source }
+        })
     }
 
     fn try_connect(place: &str, listen: u16) -> io::Result<Self> {
-        let socket = UdpSocket::bind(("0.0.0.0", listen))?;
-        // Only this peer is heard.
-        socket.connect(place)?;
+        let socket = tunnel(place, listen)?;
         socket.set_read_timeout(Some(READ_TIMEOUT))?;
         let peer = socket.peer_addr()?;
         let receiver = socket.try_clone()?;
@@ -102,6 +108,11 @@ impl Cannelloni {
         };
         match self.sequence.take(header.sequence, bytes) {
             Order::Next => {}
+            // The other end may have begun anew, with the first number there is: then nobody knows what is missing.
+            Order::Missing(_) if header.sequence == 0 => {
+                self.oddities.count("gaps between datagrams, or new beginnings of the other end");
+                self.lost(0, true, at);
+            }
             Order::Missing(missing) => {
                 self.oddities.count("gaps between datagrams");
                 // Each had at least a frame.
@@ -138,6 +149,23 @@ impl Cannelloni {
             self.oddities.count("datagrams with bytes after their frames");
         }
     }
+}
+
+/// A socket that hears only the peer: of its kind of address, and of the first of a name's that can be reached, those of IPv4 before others.
+fn tunnel(place: &str, listen: u16) -> io::Result<UdpSocket> {
+    let mut peers: Vec<SocketAddr> = place.to_socket_addrs()?.collect();
+    peers.sort_by_key(SocketAddr::is_ipv6);
+    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    for peer in peers {
+        let here: IpAddr =
+            if peer.is_ipv6() { Ipv6Addr::UNSPECIFIED.into() } else { Ipv4Addr::UNSPECIFIED.into() };
+        let socket = UdpSocket::bind((here, listen));
+        match socket.and_then(|socket| socket.connect(peer).map(|()| socket)) {
+            Ok(socket) => return Ok(socket),
+            Err(error) => last = error,
+        }
+    }
+    Err(last)
 }
 
 impl Bytes for Cannelloni {

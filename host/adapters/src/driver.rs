@@ -66,14 +66,16 @@ pub enum OpenError {
         source: io::Error,
     },
     /// There is no such adapter on USB, or more than one.
-    #[error(
-        "'{address}' is no single gs_usb adapter: {there}; name one by its serial number, as in gs_usb:SERIAL"
-    )]
+    #[error("'{address}' is no single {what}: {there}; name one by its serial number, as in {scheme}:SERIAL")]
     NoUsbAdapter {
         /// As given.
         address: String,
+        /// What was expected.
+        what: &'static str,
         /// Those that there are.
         there: String,
+        /// What its addresses begin with.
+        scheme: &'static str,
     },
     /// The adapter on USB cannot be opened.
     #[error("'{address}' cannot be opened: {reason}{advice}")]
@@ -83,7 +85,7 @@ pub enum OpenError {
         /// The system's error.
         reason: String,
         /// What to do.
-        advice: &'static str,
+        advice: String,
     },
     /// The adapter has no resistor that could be switched.
     #[error("'{address}': this adapter cannot switch its termination; leave out ?termination")]

@@ -17,6 +17,7 @@ mod adapter_clock;
 mod bit_limits;
 mod board;
 mod can_fd;
+mod canalyst_ii;
 mod cannelloni;
 mod driver;
 mod elm327;
@@ -45,6 +46,8 @@ mod source;
 mod text_lines;
 mod trace_pipe;
 mod under_way;
+mod usb_can_a;
+mod usb_device;
 
 pub use can_fd::{CanFd, can_fd};
 pub use driver::OpenError;

@@ -8,6 +8,7 @@ use cantap_formats::Format;
 use cantap_trace::grammar::bit_rate;
 use cantap_vendor::pcan_basic;
 
+use crate::canalyst_ii::CanalystIi;
 use crate::cannelloni::{self, Cannelloni};
 use crate::driver::{Driver, OpenError};
 use crate::elm327::{self, Elm327, Family, Ids};
@@ -24,6 +25,7 @@ use crate::slcan::{self, Slcan};
 use crate::socketcan::exists;
 use crate::socketcand::{self, Socketcand};
 use crate::trace_pipe::TracePipe;
+use crate::usb_can_a::{self, UsbCanA};
 
 /// Only Linux has CAN interfaces.
 #[cfg(not(target_os = "linux"))]
@@ -31,7 +33,7 @@ fn exists(_: &str) -> bool {
     false
 }
 
-/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `gvret:tcp://192.168.4.1`, `pcan:PCAN_USBBUS1`, `kvaser:0`, `elm327:tcp://192.168.0.10`,
+/// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `usb-can-a:/dev/ttyUSB0`, `gvret:tcp://192.168.4.1`, `pcan:PCAN_USBBUS1`, `kvaser:0`, `elm327:tcp://192.168.0.10`,
 /// `stn:/dev/ttyUSB0`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`, `candump:-`, `pcapng:-`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
@@ -42,6 +44,8 @@ pub struct Place {
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Kind {
     Slcan { port: String, baud: u32 },
+    CanalystIi { serial: String },
+    UsbCanA { port: String, baud: u32, extended: bool },
     GvretSerial { port: String, baud: u32, data_bitrate_bps: Option<u32> },
     GvretTcp { host: String, data_bitrate_bps: Option<u32> },
     Elm327 { family: Family, place: ElmPlace, ids: Option<Ids> },
@@ -72,10 +76,12 @@ enum TraceFormat {
 pub struct BadPlace(String);
 
 /// What addresses of adapters begin with.
-const SCHEMES: [&str; 12] = [
+const SCHEMES: [&str; 14] = [
     "socketcan:",
     "gs_usb:",
     "slcan:",
+    "usb-can-a:",
+    "canalyst-ii:",
     "gvret:",
     "pcan:",
     "kvaser:",
@@ -153,6 +159,13 @@ impl FromStr for Place {
                     .ok_or_else(|| bad("write slcan:PORT or slcan:PORT@BAUD, as in slcan:/dev/ttyACM0"))?;
                 Kind::Slcan { port, baud }
             }
+            "usb-can-a" => usb_can_a_of(rest).ok_or_else(|| {
+                bad("write usb-can-a:PORT or usb-can-a:PORT@BAUD, as in usb-can-a:/dev/ttyUSB0, and ?ids=extended after it for extended frames")
+            })?,
+            "canalyst-ii" if rest.chars().all(|letter| letter.is_ascii_graphic()) => {
+                Kind::CanalystIi { serial: rest.to_owned() }
+            }
+            "canalyst-ii" => return Err(bad("write canalyst-ii: or canalyst-ii:SERIAL")),
             "gvret" => gvret_of(rest).ok_or_else(|| {
                 bad("write gvret:PORT, gvret:PORT@BAUD or gvret:tcp://HOST, and ?data-bitrate=2M after it if the adapter is set up for a bus with CAN FD")
             })?,
@@ -185,7 +198,7 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, gvret:, pcan:, kvaser:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, usb-can-a:, canalyst-ii:, gvret:, pcan:, kvaser:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
         };
         Ok(Self { text: text.to_owned(), kind })
     }
@@ -224,6 +237,16 @@ fn gs_usb_of(rest: &str) -> Option<Kind> {
     }
     let is_serial = serial.chars().all(|letter| letter.is_ascii_graphic());
     is_serial.then(|| Kind::GsUsb { serial: serial.to_owned(), options })
+}
+
+fn usb_can_a_of(rest: &str) -> Option<Kind> {
+    let (place, extended) = match rest.split_once('?') {
+        None | Some((_, "ids=standard")) => (rest.split('?').next()?, false),
+        Some((place, "ids=extended")) => (place, true),
+        Some(_) => return None,
+    };
+    let (port, baud) = port_and_baud(place, usb_can_a::DEFAULT_BAUD)?;
+    Some(Kind::UsbCanA { port, baud, extended })
 }
 
 fn gvret_of(rest: &str) -> Option<Kind> {
@@ -316,6 +339,10 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
     let address = place.text.as_str();
     let driver: Box<dyn Driver> = match &place.kind {
         Kind::Slcan { port, baud } => Box::new(Slcan::open_port(port, *baud)?),
+        Kind::CanalystIi { serial } => Box::new(CanalystIi::connect(serial, address)?),
+        Kind::UsbCanA { port, baud, extended } => {
+            Box::new(UsbCanA::over(Line::serial(port, *baud)?, *extended, address)?)
+        }
         Kind::GvretSerial { port, baud, data_bitrate_bps } => {
             Box::new(Gvret::over(Line::serial(port, *baud)?, data_bitrate_bps.is_some(), address)?)
         }
@@ -397,6 +424,11 @@ mod tests {
             "gs_usb:?termination=off&data-bitrate=5000000",
             "slcan:/dev/ttyACM0",
             "slcan:COM5@921600",
+            "canalyst-ii:",
+            "canalyst-ii:31F0000B1",
+            "usb-can-a:/dev/ttyUSB0",
+            "usb-can-a:COM4@115200?ids=extended",
+            "usb-can-a:COM4?ids=standard",
             "gvret:/dev/ttyUSB0",
             "gvret:tcp://192.168.4.1",
             "gvret:tcp://[::1]:2300",
@@ -435,6 +467,10 @@ mod tests {
             "slcan:",
             "slcan:@9600",
             "slcan:COM1@fast",
+            "canalyst-ii:a b",
+            "usb-can-a:",
+            "usb-can-a:COM4?ids=both",
+            "usb-can-a:?ids=extended",
             "gvret:",
             "gvret:tcp://",
             "gvret:tcp://a:b",

@@ -104,7 +104,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 31] = [
+pub const ROWS: [Row; 34] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -135,6 +135,19 @@ pub const ROWS: [Row; 31] = [
         errors: "not reported",
         confirmation: Confirmation::HandedOver,
         listen_only: ListenOnly::Unconfirmed,
+        sets_bit_rate: true,
+        limits: None,
+    },
+    usb_can_a("usb-can-a", TOLD_STANDARD),
+    usb_can_a("usb-can-a-extended", TOLD_EXTENDED),
+    Row {
+        board: "canalyst-ii",
+        what: "a CANalyst-II",
+        stamps: Stamps::Adapter { grain_ns: 100_000, when: "its receiving the frame" },
+        losses: Losses::NotReported,
+        errors: "not reported",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Never,
         sets_bit_rate: true,
         limits: None,
     },
@@ -233,8 +246,26 @@ const NO_LENGTHS: &str = "a remote frame's length is not reported, and shown as 
 const STANDARD_ONLY: &str = "extended frames are not received (?ids=extended receives only them); a remote frame's length is shown as 0";
 const EXTENDED_ONLY: &str = "standard frames are not received (?ids=standard receives only them); a remote frame's length is shown as 0";
 
+const TOLD_STANDARD: &str = "it is told to receive standard frames (?ids=extended: extended ones); whether it receives the others then, its maker does not say";
+const TOLD_EXTENDED: &str = "it is told to receive extended frames (?ids=standard: standard ones); whether it receives the others then, its maker does not say";
+
 /// What the protocol of GVRET does not tell of frames on a bus with CAN FD.
 const FLAGS_BY_ADDRESS: &str = "on a bus with CAN FD neither a frame's flags are reported nor whether one of up to 8 bytes is classical: each is shown as a CAN FD frame that switches its bit rate";
+
+/// A row of adapters with the protocol of Waveshare's USB-CAN-A.
+const fn usb_can_a(board: &'static str, limits: &'static str) -> Row {
+    Row {
+        board,
+        what: "a USB-CAN-A adapter (Waveshare, Seeed Studio)",
+        stamps: Stamps::Arrival,
+        losses: Losses::NotReported,
+        errors: "error counters, once a second, if it answers",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Unconfirmed,
+        sets_bit_rate: true,
+        limits: Some(limits),
+    }
+}
 
 /// A row of GVRET adapters.
 const fn gvret(board: &'static str, limits: Option<&'static str>) -> Row {

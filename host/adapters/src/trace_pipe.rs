@@ -3,6 +3,7 @@
 //! Every format that can be read from its beginning can be read here. Its times become the device's, placed by arrivals: a trace that arrives
 //! faster than it was recorded has none to keep, and its frames are stamped on arrival. Read such a file by its name.
 
+use std::collections::VecDeque;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
@@ -14,16 +15,18 @@ use cantap_wire::{Channel, Frame, Refusal};
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
 use crate::rows::{Row, row};
-use crate::source::Source;
+use crate::source::{Piece, Source};
 
 /// How long an address waits for the first bytes to be a trace before it counts as open: a quiet bus writes nothing.
 const FIRST_BYTES: Duration = Duration::from_millis(200);
+/// Unreadable parts after which it is none.
+const MAX_FIRST: usize = 64;
 
 /// What the reader found.
 enum Found {
     Records(Vec<TraceRecord>),
-    /// Something unreadable.
-    Issue,
+    /// Something unreadable, with what it is.
+    Issue(String),
 }
 
 /// The driver.
@@ -31,7 +34,7 @@ pub(crate) struct TracePipe {
     source: Source<Found>,
     clock: AdapterClock,
     /// Found while opening.
-    first: Option<(Found, Instant)>,
+    first: VecDeque<(Found, Instant)>,
     is_open: [bool; 2],
     oddities: Oddities,
 }
@@ -56,11 +59,11 @@ impl TracePipe {
             match reader.next_batch(&mut records) {
                 None => Err("its input has ended".to_owned()),
                 Some(Ok(())) => Ok(Some(Found::Records(records))),
-                Some(Err(_)) => Ok(Some(Found::Issue)),
+                Some(Err(issue)) => Ok(Some(Found::Issue(issue.fault.to_string()))),
             }
         })
         .map_err(|error| no_trace(error.to_string()))?;
-        let first = source.next(FIRST_BYTES).map_err(no_trace)?.map(|piece| (piece.content, piece.at));
+        let first = first_of(&mut source, format).map_err(no_trace)?;
         // Nanoseconds that never start again.
         let clock = AdapterClock::new(1, 1 << 62);
         Ok(Self { source, clock, first, is_open: [false; 2], oddities: Oddities::default() })
@@ -73,7 +76,7 @@ impl TracePipe {
                     self.record(&record, arrival, reports);
                 }
             }
-            Found::Issue => {
+            Found::Issue(_) => {
                 self.oddities.count("parts that cannot be read");
                 // One gap, on whichever channel is open.
                 if let Some(channel) = Channel::ALL.into_iter().find(|channel| self.is_open[channel.index()])
@@ -98,6 +101,42 @@ impl TracePipe {
             Some(incoming) => reports.push(incoming),
             None => self.oddities.count("transmissions that failed elsewhere"),
         }
+    }
+}
+
+/// What comes within [`FIRST_BYTES`]: nothing, or something of which a part is a trace. An error is the reason why it is none.
+fn first_of(source: &mut Source<Found>, format: Format) -> Result<VecDeque<(Found, Instant)>, String> {
+    let deadline = Instant::now() + FIRST_BYTES;
+    let mut first = VecDeque::new();
+    let mut fault = None;
+    let has_ended = loop {
+        match source.next(deadline.saturating_duration_since(Instant::now())) {
+            Ok(Some(Piece { at, content })) => {
+                if let Found::Issue(what) = &content {
+                    fault.get_or_insert_with(|| what.clone());
+                }
+                let is_trace = matches!(&content, Found::Records(records) if !records.is_empty());
+                first.push_back((content, at));
+                if is_trace {
+                    return Ok(first);
+                }
+                if first.len() == MAX_FIRST {
+                    break false;
+                }
+            }
+            Ok(None) => break false,
+            Err(reason) if first.is_empty() => return Err(reason),
+            Err(_) => break true,
+        }
+    };
+    // One line may be anything, such as the end of one whose beginning went elsewhere.
+    let is_text = format == Format::Candump;
+    match fault {
+        Some(what) if is_text && (has_ended || first.len() > 1) => {
+            Err(format!("{what}; have candump write its log format: candump -L"))
+        }
+        Some(what) if !is_text => Err(format!("{what}; it is no {format}")),
+        _ => Ok(first),
     }
 }
 
@@ -133,7 +172,7 @@ impl Driver for TracePipe {
             std::thread::sleep(wait);
             return Ok(());
         }
-        if let Some((found, at)) = self.first.take() {
+        if let Some((found, at)) = self.first.pop_front() {
             self.take(found, at, reports);
             return Ok(());
         }

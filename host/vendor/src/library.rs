@@ -18,6 +18,19 @@ pub enum LoadError {
         /// Who has it.
         advice: &'static str,
     },
+    /// There is a file of that name, which is damaged, or a library for other programs than this: of 32 bits, or for another processor.
+    #[error(
+        "{name} cannot be loaded ({reason}): it is no library for {}, as this program is; {advice}",
+        std::env::consts::ARCH
+    )]
+    Unfit {
+        /// Its file.
+        name: String,
+        /// The system's reason.
+        reason: String,
+        /// Who has another.
+        advice: &'static str,
+    },
     /// It lacks a function.
     #[error("{name} has no function {function}: it is another library, or too old; {advice}")]
     NoFunction {
@@ -47,6 +60,17 @@ impl LoadError {
     }
 }
 
+/// The loader's words about a file that is no library for this program: Windows' number of them, glibc's, musl's, macOS'.
+const UNFIT: [&str; 7] = [
+    "(os error 193)",
+    "wrong ELF class",
+    "invalid ELF header",
+    "file too short",
+    "Exec format error",
+    "incompatible architecture",
+    "not a mach-o file",
+];
+
 /// A library that is loaded, and what errors call it.
 pub(crate) struct Loaded {
     pub library: Library,
@@ -68,7 +92,15 @@ impl Loaded {
         let name = path.map_or_else(|| in_system(system_name), |path| path.display().to_string());
         match loaded {
             Ok(library) => Ok(Self { library, name, advice }),
-            Err(error) => Err(LoadError::NotInstalled { name, reason: reason(&error), advice }),
+            Err(error) => {
+                let reason = reason(&error);
+                let is_unfit = UNFIT.iter().any(|words| reason.contains(words));
+                Err(if is_unfit {
+                    LoadError::Unfit { name, reason, advice }
+                } else {
+                    LoadError::NotInstalled { name, reason, advice }
+                })
+            }
         }
     }
 

@@ -11,7 +11,7 @@ use cantap_serve::audit::Audit;
 #[cfg(feature = "tls")]
 use cantap_serve::permissions::{Permissions, PermissionsError};
 #[cfg(feature = "tls")]
-use cantap_serve::tls::{self, Server};
+use cantap_serve::tls::Server;
 #[cfg(unix)]
 use nix::sys::signal::{SigSet, Signal};
 
@@ -46,6 +46,9 @@ impl Upkeep {
             signals.add(Signal::SIGHUP);
             signals.thread_block().map(|()| signals)
         });
+        // Elsewhere there are no hang-ups, nor files to read again.
+        #[cfg(not(unix))]
+        let _ = (permissions, is_encrypted);
         #[cfg(feature = "tls")]
         if let Some(path) = permissions {
             Permissions::read(path)?;
@@ -135,7 +138,7 @@ impl Reread {
             match read() {
                 Ok((permissions, server)) => {
                     self.permit(permissions.as_ref());
-                    server.into_iter().for_each(tls::Reread::apply);
+                    server.into_iter().for_each(cantap_serve::tls::Reread::apply);
                 }
                 Err(error) => {
                     stderr::warn(&format!("{error}; the permissions and certificates all stay as they were"));

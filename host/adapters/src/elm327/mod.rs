@@ -67,6 +67,10 @@ const REFUSED_WITHIN: Duration = Duration::from_millis(100);
 const RETRY_AFTER: Duration = Duration::from_millis(250);
 /// It is told to go on no sooner than this after the last time: one that prompts without an end is not answered without an end.
 const GO_ON_EVERY: Duration = Duration::from_millis(20);
+/// How soon it prompts once it has stopped, how often it is asked for that before it is given up, and the command for it, which it has had before.
+const PROMPTS_WITHIN: Duration = Duration::from_secs(1);
+const MAX_UNPROMPTED: u32 = 3;
+const ASK_FOR_PROMPT: &[u8] = b"ATL0\r";
 /// Lines kept of an answer. None has as many.
 const MAX_ANSWER_LINES: usize = 32;
 /// Refusals in a row after which there is no more monitoring.
@@ -105,6 +109,8 @@ pub(crate) struct Elm327 {
     /// When it was last told to monitor.
     started: Instant,
     refusals: u32,
+    /// Times that it was asked for its prompt since it stopped.
+    unprompted: u32,
     /// Why it has ended.
     ended: Option<String>,
     backlog: Vec<Incoming>,
@@ -125,6 +131,7 @@ impl Elm327 {
             monitoring: Monitoring::Off,
             started: Instant::now(),
             refusals: 0,
+            unprompted: 0,
             ended: None,
             backlog: Vec::new(),
             oddities: Oddities::default(),
@@ -184,7 +191,10 @@ impl Elm327 {
                     self.oddities.count("ends of monitoring without a reason");
                     self.monitoring = Monitoring::Due { again: self.next_start(arrival) };
                 }
-                Monitoring::Ending { again } => self.monitoring = Monitoring::Due { again },
+                Monitoring::Ending { again } => {
+                    self.unprompted = 0;
+                    self.monitoring = Monitoring::Due { again };
+                }
                 Monitoring::Off | Monitoring::Due { .. } => self.oddities.count("prompts without a command"),
             },
         }
@@ -266,10 +276,19 @@ impl Elm327 {
 
     /// Monitors again where that is due.
     fn look_after_time(&mut self) {
-        if let Monitoring::Due { again } = self.monitoring
-            && again <= Instant::now()
-        {
-            self.start_monitoring();
+        let now = Instant::now();
+        match self.monitoring {
+            Monitoring::Due { again } if again <= now => self.start_monitoring(),
+            Monitoring::Ending { again } if again + PROMPTS_WITHIN <= now => {
+                if self.unprompted == MAX_UNPROMPTED {
+                    return self.end("it has stopped, and no longer answers; unplug it and plug it in again");
+                }
+                self.oddities.count("prompts that did not come");
+                self.unprompted += 1;
+                self.line.write(ASK_FOR_PROMPT);
+                self.monitoring = Monitoring::Ending { again: now };
+            }
+            _ => {}
         }
     }
 

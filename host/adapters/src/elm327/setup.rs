@@ -28,8 +28,7 @@ impl Elm327 {
         self.line.write(INTERRUPT);
         self.line.discard(QUIET).map_err(|_| foreign())?;
         let greeting = self.ask("ATZ", START_WITHIN).ok().flatten().ok_or_else(foreign)?;
-        let is_banner = |line: &&String| line.contains("ELM32") || line.starts_with("OBDII");
-        let banner = greeting.iter().find(is_banner).ok_or_else(foreign)?;
+        let banner = greeting.iter().find(|line| is_banner(line)).ok_or_else(foreign)?;
         self.version = version(banner);
         if self.family == Family::Stn {
             let stn = self.ask("STI", ANSWER_WITHIN).ok().flatten().unwrap_or_default();
@@ -38,7 +37,7 @@ impl Elm327 {
         }
         // A chip that refuses one of these prints more than it must, or remembers what it was set to.
         for command in ["ATE0", "ATL0", "ATS0", "ATM0", "ATAL"] {
-            self.ask(command, ANSWER_WITHIN).map_err(|_| foreign())?;
+            self.ask(command, ANSWER_WITHIN).ok().flatten().ok_or_else(foreign)?;
         }
         // Without these, its lines are no frames.
         for command in ["ATH1", "ATCAF0"] {
@@ -46,7 +45,11 @@ impl Elm327 {
                 return Err(OpenError::Unsuitable { address: address.to_owned(), command });
             }
         }
-        self.is_silent = self.silence(true);
+        let is_in_step = self.answers_in_step();
+        self.is_silent = is_in_step && self.silence(true);
+        if !is_in_step || !self.answers_in_step() {
+            return Err(foreign());
+        }
         if self.family == Family::Stn {
             self.has_dlc = self.accepts("ATD1", ANSWER_WITHIN);
             return Ok(());
@@ -59,6 +62,13 @@ impl Elm327 {
         Ok(())
     }
 
+    /// Whether the next answer is the one to the next command. Where answers come twice or late, a refusal to be silent would be taken for another
+    /// command's `OK`.
+    fn answers_in_step(&mut self) -> bool {
+        let answer = self.ask("ATI", ANSWER_WITHIN);
+        matches!(answer, Ok(Some(lines)) if lines.last().is_some_and(|line| is_banner(line)))
+    }
+
     /// Sets whether it acknowledges nothing while it monitors. Returns whether it has confirmed that.
     fn silence(&mut self, is_silent: bool) -> bool {
         let stn = if is_silent { "STCMM0" } else { "STCMM1" };
@@ -68,6 +78,9 @@ impl Elm327 {
 
     /// Selects the bus: its bit rate, which identifiers, and whether to acknowledge frames.
     pub(super) fn select(&mut self, opening: Opening) -> Result<(), Refusal> {
+        if !self.answers_in_step() {
+            return Err(Refusal::Hardware);
+        }
         let silent = self.silence(opening.listen_only);
         if opening.listen_only && !silent {
             return Err(Refusal::Unsupported);
@@ -126,6 +139,11 @@ impl Elm327 {
             Ok(Some(_)) => Err(refusal),
         }
     }
+}
+
+/// What it says of itself.
+fn is_banner(line: &str) -> bool {
+    line.contains("ELM32") || line.starts_with("OBDII")
 }
 
 fn is_ok(answer: &Answer) -> bool {

@@ -2,12 +2,13 @@
 
 use std::time::Duration;
 
-use nusb::transfer::{Buffer, Bulk, ControlIn, ControlOut, ControlType, In, Out, Recipient, TransferError};
-use nusb::{DeviceInfo, Endpoint, ErrorKind, Interface, MaybeFuture};
+use nusb::transfer::{Buffer, Bulk, ControlIn, ControlOut, ControlType, In, Out, Recipient};
+use nusb::{Endpoint, Interface, MaybeFuture};
 
 use super::pipes::Usb;
 use crate::driver::OpenError;
 use crate::source::{Piece, Source};
+use crate::usb_device::{Kind, reason};
 
 /// Vendor and product of those that Linux's driver knows (`gs_usb_table` of `drivers/net/can/usb/gs_usb.c`).
 const KNOWN: [(u16, u16); 6] = [
@@ -23,6 +24,12 @@ const KNOWN: [(u16, u16); 6] = [
     CANNECTIVITY,
 ];
 const CANNECTIVITY: (u16, u16) = (0x1209, 0xCA01);
+const KIND: Kind = Kind {
+    scheme: "gs_usb",
+    what: "gs_usb adapter",
+    is_one: |device| KNOWN.contains(&(device.vendor_id(), device.product_id())),
+    kernel_driver: Some("gs_usb"),
+};
 const INTERFACE: u8 = 0;
 /// Time limit for a request with data for the adapter.
 const REQUEST_WITHIN: Duration = Duration::from_secs(1);
@@ -42,37 +49,11 @@ pub(super) struct UsbAdapter {
     confirms: bool,
 }
 
-/// A serial number as people see it, and type it.
-fn serial_of(device: &DeviceInfo) -> String {
-    device.serial_number().unwrap_or_default().chars().filter(char::is_ascii_graphic).collect()
-}
-
 impl UsbAdapter {
     /// Opens the adapter with a serial number, or the only one if that is empty. Returns the number.
     pub fn open(serial: &str, address: &str) -> Result<(Self, String), OpenError> {
-        let failed = |error: nusb::Error| OpenError::Usb {
-            address: address.to_owned(),
-            reason: error.to_string(),
-            advice: advice(error.kind()),
-        };
-        let all = nusb::list_devices().wait().map_err(failed)?;
-        let known: Vec<DeviceInfo> =
-            all.filter(|device| KNOWN.contains(&(device.vendor_id(), device.product_id()))).collect();
-        let serials: Vec<String> = known.iter().map(serial_of).collect();
-        let mut fitting =
-            known.iter().zip(&serials).filter(|(_, number)| serial.is_empty() || *number == serial);
-        let (Some((device, number)), None) = (fitting.next(), fitting.next()) else {
-            let there = match &serials[..] {
-                [] => "there is none".to_owned(),
-                serials => format!("there are {}", serials.join(", ")),
-            };
-            return Err(OpenError::NoUsbAdapter { address: address.to_owned(), there });
-        };
-        let interface = device
-            .open()
-            .wait()
-            .and_then(|device| device.claim_interface(INTERFACE).wait())
-            .map_err(failed)?;
+        let (device, interface, number) = KIND.open(serial, address)?;
+        let failed = |error| KIND.failed(&error, address);
         let bulk = |is_in: bool| {
             let endpoints = interface.descriptor().into_iter().flat_map(|setting| setting.endpoints());
             let mut addresses = endpoints
@@ -88,7 +69,7 @@ impl UsbAdapter {
         let source =
             reader(input).map_err(|source| OpenError::Unreachable { address: address.to_owned(), source })?;
         let confirms = (device.vendor_id(), device.product_id()) == CANNECTIVITY;
-        Ok((Self { interface, source, out, confirms }, number.clone()))
+        Ok((Self { interface, source, out, confirms }, number))
     }
 }
 
@@ -107,30 +88,6 @@ fn reader(mut input: Endpoint<Bulk, In>) -> std::io::Result<Source<Vec<u8>>> {
         input.submit(buffer);
         Ok((!bytes.is_empty()).then_some(bytes))
     })
-}
-
-/// Why there is no more to come.
-fn reason(error: TransferError) -> String {
-    match error {
-        TransferError::Disconnected => "it was unplugged".to_owned(),
-        TransferError::Stall => "it refuses transfers; unplug it and plug it in again".to_owned(),
-        other => other.to_string(),
-    }
-}
-
-/// What to do about an adapter that cannot be opened.
-const fn advice(kind: ErrorKind) -> &'static str {
-    match kind {
-        ErrorKind::Busy if cfg!(target_os = "linux") => {
-            "; the kernel's driver has it: use its interface (-d can0), or as root: rmmod gs_usb"
-        }
-        ErrorKind::Busy => "; another program has it",
-        ErrorKind::PermissionDenied if cfg!(target_os = "linux") => {
-            "; give your user the right with a udev rule, or run this as root"
-        }
-        _ if cfg!(windows) => "; give the device the driver WinUSB, for example with Zadig",
-        _ => "",
-    }
 }
 
 impl Usb for UsbAdapter {

@@ -6,6 +6,7 @@ use cantap::transmit::Stream;
 use cantap::wire::Refusal;
 use cantap::wire::message::TxFdFrame;
 use cantap::{Channel, DeviceError, TraceFrame};
+use cantap_adapters::{OpenError, Place};
 
 use crate::{frames, losses, open, send, until_frame};
 
@@ -130,4 +131,69 @@ fn an_fd_frame_needs_a_channel_that_sends_and_has_its_time() {
     device.abort(Channel::Can1).unwrap();
     assert!(ends.recv().unwrap().result.is_err());
     assert_eq!(refusal(Some(u64::MAX)), Refusal::TooFarAhead);
+}
+
+/// A port that another program has is not a host that cannot be reached.
+#[test]
+fn a_port_that_is_taken_here_is_named_with_what_to_do() {
+    let taken = UdpSocket::bind("0.0.0.0:0").unwrap();
+    let place: Place =
+        format!("cannelloni://127.0.0.1:9?listen={}", taken.local_addr().unwrap().port()).parse().unwrap();
+    let error = cantap_adapters::open(&place).err().unwrap();
+    assert!(matches!(error, OpenError::Channel { .. }), "{error}");
+    assert!(
+        error.to_string().contains("another program has UDP port") && error.to_string().contains("?listen="),
+        "{error}"
+    );
+}
+
+#[test]
+fn the_other_end_may_have_an_address_of_ipv6() {
+    let Ok(peer) = UdpSocket::bind("[::1]:0") else {
+        println!("not tested: this computer has no IPv6");
+        return;
+    };
+    let listen = UdpSocket::bind("[::1]:0").unwrap().local_addr().unwrap().port();
+    let device = open(&format!("cannelloni://{}?listen={listen}", peer.local_addr().unwrap()));
+    device.join(Channel::Can1, 500_000).unwrap();
+    peer.send_to(&datagram(0, 1, &[(0x123, &[0xAA])]), ("::1", listen)).unwrap();
+    assert_eq!(frames(&until_frame(&device, "123#AA")), ["123#AA"]);
+    send(&device, "7FF#").result.unwrap();
+    assert!(peer.recv(&mut [0; 64]).is_ok());
+}
+
+/// Datagrams of no bytes and of very many, counts that lie, and an other end that goes and begins anew.
+#[test]
+fn babbling_and_new_beginnings_lose_nothing_that_is_known_and_invent_nothing() {
+    let peer = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let at = peer.local_addr().unwrap();
+    let listen = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let device = open(&format!("cannelloni://{at}?listen={listen}"));
+    device.join(Channel::Can1, 500_000).unwrap();
+    let here = ("127.0.0.1", listen);
+    peer.send_to(&datagram(199, 1, &[(0x100, &[])]), here).unwrap();
+    for bytes in [vec![], vec![0; 4000], vec![0xFF; 4000], vec![2, 0], datagram(200, 0, &[])] {
+        peer.send_to(&bytes, here).unwrap();
+    }
+    // All the frames that a datagram can announce, and one.
+    peer.send_to(&datagram(201, u16::MAX, &[(0x101, &[1])]), here).unwrap();
+    peer.send_to(&datagram(202, 1, &[(0x102, &[])]), here).unwrap();
+    let records = until_frame(&device, "102#");
+    assert_eq!(frames(&records), ["100#", "101#01", "102#"]);
+    assert_eq!(losses(&records), [("link", u32::from(u16::MAX) - 1)]);
+    // It is gone: what is sent is handed over to nobody, and the session goes on.
+    drop(peer);
+    for _ in 0..3 {
+        send(&device, "7FF#").result.unwrap();
+    }
+    let peer = UdpSocket::bind(at).unwrap();
+    peer.send_to(&datagram(0, 1, &[(0x103, &[])]), here).unwrap();
+    let records = until_frame(&device, "103#");
+    assert!(frames(&records).ends_with(&["103#".to_owned()]), "{:?}", frames(&records));
+    // Not the 53 datagrams that its first number might be taken for.
+    assert_eq!(losses(&records), [("link", 0)]);
+    let failures = device.failures().unwrap().last;
+    for kind in ["datagrams that are too short", "of another version", "new beginnings"] {
+        assert!(failures.contains(kind), "{failures}");
+    }
 }

@@ -16,6 +16,23 @@ enum Seen {
     Frame(Vec<u8>),
 }
 
+/// What it answers to a command that asks for something.
+fn answer(command: u8, buses: [u32; 2], honours_listening: bool) -> Option<Vec<u8>> {
+    let bus = |setting: u32| {
+        let listens = u8::from(setting >> 29 & 1 == 1 && honours_listening);
+        let mut bytes = vec![u8::from(setting >> 30 & 1 == 1) | listens << 4];
+        bytes.extend_from_slice(&(setting & 0xF_FFFF).to_le_bytes());
+        bytes
+    };
+    Some(match command {
+        6 => [vec![0xF1, 6], bus(buses[0]), bus(buses[1])].concat(),
+        7 => vec![0xF1, 7, 0x6A, 2, 0x20, 0, 0, 0],
+        9 => vec![0xF1, 9, 0xDE, 0xAD],
+        12 => vec![0xF1, 12, 2],
+        _ => return None,
+    })
+}
+
 /// Serves one client, passes on what it does, and returns the stream to it. One that is deaf to `LISTENS` says so.
 fn start(honours_listening: bool) -> (String, Receiver<TcpStream>, Receiver<Seen>) {
     let server = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -51,19 +68,10 @@ fn start(honours_listening: bool) -> (String, Receiver<TcpStream>, Receiver<Seen
                     report.send(Seen::Buses(buses)).unwrap();
                     continue;
                 }
-                6 => {
-                    let bus = |setting: u32| {
-                        let listens = u8::from(setting >> 29 & 1 == 1 && honours_listening);
-                        let mut bytes = vec![u8::from(setting >> 30 & 1 == 1) | listens << 4];
-                        bytes.extend_from_slice(&(setting & 0xF_FFFF).to_le_bytes());
-                        bytes
-                    };
-                    [vec![0xF1, 6], bus(buses[0]), bus(buses[1])].concat()
-                }
-                7 => vec![0xF1, 7, 0x6A, 2, 0x20, 0, 0, 0],
-                9 => vec![0xF1, 9, 0xDE, 0xAD],
-                12 => vec![0xF1, 12, 2],
-                _ => continue,
+                command => match answer(command, buses, honours_listening) {
+                    Some(answer) => answer,
+                    None => continue,
+                },
             };
             stream.write_all(&answer).unwrap();
         }
@@ -268,4 +276,35 @@ fn one_that_says_something_else_without_an_end_is_not_waited_for() {
     });
     assert!(matches!(cantap_adapters::open(&place), Err(cantap_adapters::OpenError::Foreign { .. })));
     babbler.join().unwrap();
+}
+
+/// The same on a serial port: set to listen, heard, and pulled out.
+#[cfg(unix)]
+#[test]
+fn on_a_serial_port_it_is_the_same() {
+    let (mut bytes, mut buses) = (Vec::<u8>::new(), [0; 2]);
+    let port = crate::port::Port::start(move |byte| {
+        bytes.push(byte);
+        let &[0xF1, command, ref rest @ ..] = &bytes[..] else {
+            if bytes != [0xF1] {
+                bytes.clear();
+            }
+            return Vec::new();
+        };
+        if command == 5 && rest.len() < 8 {
+            return Vec::new();
+        }
+        if let Some((settings, [])) = rest.split_first_chunk::<8>() {
+            buses = [0, 4].map(|at| u32::from_le_bytes(settings[at..at + 4].try_into().unwrap()));
+        }
+        bytes.clear();
+        answer(command, buses, true).unwrap_or_default()
+    });
+    let device = open(&format!("gvret:{}", port.path));
+    device.listen(Channel::Can1, 500_000).unwrap();
+    port.says(received(1000, 0x123, 0, &[0xAA]));
+    until_frame(&device, "123#AA");
+    port.pull();
+    let end = device.records().find_map(Result::err).unwrap();
+    assert!(matches!(end, DeviceError::Vanished { .. }), "{end}");
 }

@@ -13,6 +13,8 @@ mod slcan;
 mod socketcand;
 #[cfg(unix)]
 mod trace_pipe;
+#[cfg(unix)]
+mod usb_can_a;
 
 use cantap::device::Transmission;
 use cantap::{Device, TraceEvent, TraceFrame, TraceRecord};

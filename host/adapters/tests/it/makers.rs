@@ -116,8 +116,13 @@ fn a_library_that_is_not_there_is_named_with_who_has_it() {
     }
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("libtext.so");
-    std::fs::write(&file, "no library").unwrap();
-    assert!(open_error(&format!("pcan:?library={}", file.display())).contains("cannot be loaded"));
+    // One of 32 bits, as far as the loader looks, and a text.
+    let elf32 = [b"\x7FELF\x01\x01\x01".as_slice(), &[0; 9], &[3, 0, 3, 0, 1, 0, 0, 0], &[0; 4096]].concat();
+    for content in [elf32, b"no library".repeat(100)] {
+        std::fs::write(&file, content).unwrap();
+        let error = open_error(&format!("pcan:?library={}", file.display()));
+        assert!(error.contains("cannot be loaded") && error.contains("is no library for"), "{error}");
+    }
     assert!(open_error("pcan:?library=libpcanbasic.so").contains("must begin with the root"));
 }
 

@@ -63,7 +63,7 @@ impl Port {
         drop((self.other_end, self.user));
     }
 
-    pub fn says(&self, text: &str) {
-        write(&self.other_end, text.as_bytes());
+    pub fn says(&self, bytes: impl AsRef<[u8]>) {
+        write(&self.other_end, bytes.as_ref());
     }
 }

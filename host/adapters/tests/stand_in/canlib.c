@@ -25,10 +25,16 @@ static uint64_t now_us(void) {
     return (uint64_t)now.tv_sec * 1000000 + (uint64_t)now.tv_nsec / 1000;
 }
 
-/* A library in another process: a hundred messages, one each millisecond: standard and extended in turn. */
-static void talk(void) {
+/* What the test wants of a library in another process: it talks, vanishes meanwhile, acknowledges whatever it is told, refuses, or counts channels
+   that are not there. */
+static int is(const char *way) {
     const char *wanted = getenv("STANDIN");
-    if (!wanted || strcmp(wanted, "talks")) return;
+    return wanted && !strcmp(wanted, way);
+}
+
+/* A hundred messages, one each millisecond: standard and extended in turn. */
+static void talk(void) {
+    if (!is("talks") && !is("vanishes")) return;
     began_us = now_us();
     for (unsigned i = 0; i < 100; i++) {
         Message m = { .id = (long)(i % 2 ? 0x18DA0000 + i : 0x100 + i), .len = i % 9, .flags = i % 2 ? 4 : 2, .time = 1000 * i };
@@ -39,9 +45,8 @@ static void talk(void) {
 
 void canInitializeLibrary(void) {}
 int canGetNumberOfChannels(int *count) {
-    const char *wanted = getenv("STANDIN");
-    if (wanted && !strcmp(wanted, "refuses")) return HARDWARE;
-    *count = wanted && !strcmp(wanted, "lies") ? 2000000000 : 2;
+    if (is("refuses")) return HARDWARE;
+    *count = is("lies") ? 2000000000 : 2;
     return OK;
 }
 
@@ -82,7 +87,7 @@ int canSetBusParamsFd(int handle, long rate, unsigned s1, unsigned s2, unsigned 
     return check(handle);
 }
 
-int canSetBusOutputControl(int handle, unsigned type) { if (!deaf) output = type; return check(handle); }
+int canSetBusOutputControl(int handle, unsigned type) { if (!deaf && !is("acknowledges")) output = type; return check(handle); }
 int canGetBusOutputControl(int handle, unsigned *type) { *type = output; return check(handle); }
 
 int canIoCtl(int handle, unsigned function, void *buffer, unsigned len) {
@@ -102,6 +107,7 @@ int canRead(int handle, long *id, void *data, unsigned *len, unsigned *flags, un
         Message *m = &queue[tail++ % 4096];
         *id = m->id; *len = m->len; *flags = m->flags; *time = m->time / scale;
         memcpy(data, m->data, m->flags & 0x10000 ? 64 : 8);
+        if (tail == 50 && is("vanishes")) unplugged = 1;
     }
     pthread_mutex_unlock(&lock);
     return status;

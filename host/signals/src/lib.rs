@@ -58,6 +58,7 @@ pub use number::{Number, shortest_of_f32};
 pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};
+pub use sheet::rows_of_text;
 
 /// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, a table of signals in `.xlsx`, `.csv` or `.tsv`, or
 /// `.toml` for cantap's own signal file. For a KCD or ARXML

@@ -4,7 +4,7 @@ mod on_device;
 
 use std::sync::{Arc, Mutex};
 
-use cantap_scripts::{Bench, Script, Simulation, library};
+use cantap_scripts::{Bench, BenchBus, Script, Simulation, library};
 use cantap_signals::Decoder;
 use cantap_trace::TraceRecord;
 use pyo3::prelude::*;
@@ -71,12 +71,15 @@ impl NodeBus {
         let channel = channel.0;
         let kind = match address {
             None => {
+                let bus: BenchBus = options.parse().map_err(Error::argument)?;
                 let bench = Bench {
-                    options: options.parse().map_err(Error::argument)?,
+                    options: bus.options,
+                    faults: bus.faults,
                     bitrates_bps: [bitrate_bps.unwrap_or(SIMULATED_BPS); 2],
                     decoder,
                     seed: SEED,
                     keys: Vec::new(),
+                    readable: None,
                     duration_ns: u64::MAX,
                 };
                 Kind::Simulated(Box::new(bench.start()))

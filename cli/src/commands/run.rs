@@ -14,10 +14,11 @@ use cantap::{Channel, TraceRecord};
 use cantap_address::Address;
 use cantap_formats::WriteOptions;
 use cantap_scripts::library::{self, LibraryError, ReadyNode};
-use cantap_scripts::{Bench, BrokenOff, Live, LiveError, Message, Outcome, Report, Script, TestResult};
+use cantap_scripts::{
+    Bench, BenchBus, BrokenOff, Live, LiveError, Message, Outcome, Report, Script, TestResult,
+};
 use cantap_trace::clean;
 use cantap_trace::counted;
-use cantap_virtual::Options;
 use cantap_work::{atomic_file, interrupt, rounded};
 use serde_json::{Value, json};
 
@@ -72,9 +73,10 @@ pub struct Args {
     /// Where the device is: a serial port, or virtual. Without it, the buses are simulated.
     #[arg(short, long, add = completion::devices())]
     device: Option<Address>,
-    /// What else is on the simulated buses, as in a virtual device's address: car, canopen, load=20, errors=1.
+    /// What else is on the simulated buses, as in a virtual device's address: car, canopen, load=20, errors=1; and what goes wrong there:
+    /// error_burst=2s+10ms, bus_off=NODE@2s, power_off=NODE@2s+500ms, stall=2s+200ms, lose=NODE@2s*3.
     #[arg(long, value_name = "OPTIONS", default_value = "load=0", conflicts_with = "device")]
-    bus: Options,
+    bus: BenchBus,
     #[command(flatten)]
     open: ChannelArgs,
     #[command(flatten)]
@@ -85,6 +87,9 @@ pub struct Args {
     /// End after this time, of the bus.
     #[arg(long = "for", value_name = "TIME", value_parser = args::duration)]
     duration: Option<Duration>,
+    /// Let the scripts read the files in this folder, by read(…) and csv(…); otherwise they read none.
+    #[arg(long, value_name = "FOLDER")]
+    allow_read: Option<PathBuf>,
     /// Select other random numbers.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -131,7 +136,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let scripts: Vec<Script> = args.scripts.iter().map(|path| read(path)).collect::<anyhow::Result<_>>()?;
     if args.explain {
-        explain::explain(&scripts, args.device.as_ref(), args.json)?;
+        explain::explain(&scripts, args.device.as_ref(), |device| args.channels(device), args.json)?;
         return Ok(ExitCode::SUCCESS);
     }
     let given: Vec<&Address> = args.device.iter().collect();
@@ -142,6 +147,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     if let Some(path) = &args.junit {
         refuse_no_place(path)?;
+    }
+    if let Some(folder) = args.allow_read.as_ref().filter(|folder| !folder.is_dir()) {
+        bail!("--allow-read {}: there is no such folder", folder.display());
     }
     interrupt::watch()?;
     let mut trace = match &args.output {
@@ -166,7 +174,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Some(address) => {
             let device = address.open()?;
             args.open.open(&device, args.channels(&device).into_iter(), Mode::Normal, None)?;
-            let live = Live { decoder, seed: args.seed, duration: args.duration };
+            let live =
+                Live { decoder, seed: args.seed, readable: args.allow_read.clone(), duration: args.duration };
             let mut keyboard = Keyboard::open();
             let has_keyboard = keyboard.is_some();
             let mut next_key = || keyboard.as_mut().and_then(Keyboard::next);
@@ -236,11 +245,13 @@ impl Args {
             .filter(|duration_ns| i64::try_from(*duration_ns).is_ok())
             .ok_or_else(|| usage("--for is longer than the 292 years that times can hold"))?;
         Ok(Bench {
-            options: self.bus.clone(),
+            options: self.bus.options.clone(),
+            faults: self.bus.faults.clone(),
             bitrates_bps,
             decoder,
             seed: self.seed,
             keys: self.keys.to_vec(),
+            readable: self.allow_read.clone(),
             duration_ns,
         })
     }
@@ -370,7 +381,7 @@ fn describe(out: &mut impl Write, test: &TestResult) -> std::io::Result<()> {
         Outcome::Passed => writeln!(out, "ok     {name} ({milliseconds:.3} ms)"),
         Outcome::Failed(reason) => {
             writeln!(out, "FAILED {name} ({milliseconds:.3} ms): {}", clean::lines(reason))?;
-            test.trace.iter().try_for_each(|line| writeln!(out, "       {line}"))
+            test.trace_lines().try_for_each(|line| writeln!(out, "       {line}"))
         }
     }
 }
@@ -394,5 +405,6 @@ fn object(test: &TestResult) -> Value {
         "passed": reason.is_none(),
         "text": reason,
         "trace": test.trace,
+        "trace_after": test.trace_after,
     })
 }

@@ -141,6 +141,8 @@ fn played(
     let duration_ns = trace.duration_ns.clamp(MIN_RUN_NS, MAX_RUN_NS);
     let bench = Bench {
         keys: Vec::new(),
+        faults: Vec::new(),
+        readable: None,
         options: "load=0".parse().context("the bus without anything else on it")?,
         bitrates_bps,
         decoder: Arc::new(Decoder::new(Vec::new())),

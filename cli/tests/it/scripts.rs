@@ -10,7 +10,9 @@ fn documented() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     let scripts: Vec<&str> =
         page.split("```rhai\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
-    for (name, script) in ["speed.rhai", "tester.rhai"].iter().zip(scripts) {
+    for (name, script) in
+        ["speed.rhai", "tester.rhai", "table.rhai", "dash.rhai", "missing.rhai"].iter().zip(scripts)
+    {
         std::fs::write(folder.path().join(name), script).unwrap();
     }
     folder
@@ -30,15 +32,46 @@ fn run(folder: &Path, arguments: &[&str]) -> Output {
 }
 
 #[test]
-fn the_pages_example_prints_what_the_page_shows() {
+fn the_pages_examples_print_what_the_page_shows() {
     let folder = documented();
-    let output = run(folder.path(), &["speed.rhai", "tester.rhai"]);
-    assert!(output.status.success(), "{output:?}");
+    std::fs::create_dir(folder.path().join("limits")).unwrap();
+    std::fs::write(folder.path().join("limits/sensors.csv"), "name,low,high\noil,110,90\n").unwrap();
     let page =
         std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/scripts.md")).unwrap();
-    let shown =
-        page.split("$ cantap run speed.rhai tester.rhai\n").nth(1).unwrap().split("```").next().unwrap();
-    assert_eq!(text(&output.stdout), shown);
+    for (line, code) in [
+        ("speed.rhai tester.rhai", 0),
+        ("table.rhai --allow-read limits", 1),
+        ("node:engine dash.rhai missing.rhai", 0),
+    ] {
+        let output = run(folder.path(), &line.split(' ').collect::<Vec<_>>());
+        assert_eq!(output.status.code(), Some(code), "{output:?}");
+        let shown = page.split(&format!("$ cantap run {line}\n")).nth(1).unwrap();
+        assert_eq!(text(&output.stdout), shown.split("```").next().unwrap());
+    }
+}
+
+/// What the bus's options let go wrong is what the functions do, and what cannot is refused before the run.
+#[test]
+fn the_bus_goes_wrong_at_its_times() {
+    let folder = documented();
+    let waits = "fn test_it() { wait(\"2s\"); expect(\"3A0\", \"500ms\", |f| f.data[0] == 1); }";
+    std::fs::write(folder.path().join("waits.rhai"), waits).unwrap();
+    let nodes = ["node:engine", "dash.rhai", "waits.rhai"];
+    let with = |bus: &str| run(folder.path(), &[&nodes[..], &["--bus", bus]].concat());
+    assert!(with("power_off=engine@2s").status.success());
+    assert_eq!(with("load=5").status.code(), Some(1));
+    for (bus, reason) in [
+        ("power_off=motor@2s", "there is no node motor; there are engine, dash, waits"),
+        ("power_off=waits@2s", "has tests"),
+        ("power_off=2s", "write it as power_off=engine@1s+500ms"),
+        ("explode=2s", "error_burst, bus_off, power_off, stall, lose"),
+    ] {
+        let output = with(bus);
+        assert!(!output.status.success() && text(&output.stderr).contains(reason), "{bus}: {output:?}");
+        assert!(output.stdout.is_empty(), "{output:?}");
+    }
+    let output = run(folder.path(), &["table.rhai", "--allow-read", "nowhere"]);
+    assert!(text(&output.stderr).contains("--allow-read nowhere: there is no such folder"), "{output:?}");
 }
 
 #[test]

@@ -1,7 +1,9 @@
 //! What a script's thread and the bus that it is on pass to each other, in turns.
 
+use cantap::wire::message::Filter;
 use cantap_can::{BusErrorKind, CHANNELS, Channel, ErrorState, Frame};
 
+use crate::faults::Fault;
 use crate::report::Outcome;
 
 /// What happened on a bus.
@@ -43,8 +45,14 @@ pub enum Output {
     Repeat { handle: u32, channel: Channel, frame: Frame, period_ns: u64 },
     /// End a repetition.
     EndRepeat { handle: u32 },
+    /// The device sends a frame by itself for each that a filter selects, until that ends.
+    Reply { channel: Channel, slot: u8, entry: Option<(Filter, Frame)> },
     /// A line for the user.
     Log(String),
+    /// Something goes wrong on the simulated bus, or with the node at this place, or with all of them.
+    Fault { node: Option<usize>, fault: Fault },
+    /// The names of the tests that the script's own lines have made, all of them.
+    Tests(Vec<String>),
     /// A test has begun.
     TestBegan(String),
     /// A test has ended.
@@ -58,7 +66,12 @@ impl Output {
             Self::Log(text) | Self::TestBegan(text) => text.capacity(),
             Self::Test { name, outcome: Outcome::Failed(reason), .. } => name.capacity() + reason.capacity(),
             Self::Test { name, .. } => name.capacity(),
-            Self::Send { .. } | Self::Repeat { .. } | Self::EndRepeat { .. } => 0,
+            Self::Tests(names) => names.iter().map(String::capacity).sum(),
+            Self::Send { .. }
+            | Self::Repeat { .. }
+            | Self::EndRepeat { .. }
+            | Self::Reply { .. }
+            | Self::Fault { .. } => 0,
         }
     }
 }

@@ -1,7 +1,6 @@
 //! The functions that scripts call.
 
 use std::rc::Rc;
-use std::time::Duration;
 
 use cantap_can::{Channel, Frame, Id};
 use cantap_protocols::active::exchange::{Answerer, Exchange, ResponseTiming};
@@ -15,10 +14,10 @@ use rhai::{Array, Blob, Dynamic, Engine, FnPtr, Map, NativeCallContext};
 use crate::byte_functions::byte;
 use crate::exchange::Output;
 use crate::handlers::{Repeated, Selector};
-use crate::report::Outcome;
 use crate::runtime::Runtime;
-use crate::script_frame::ScriptFrame;
+use crate::script_frame::{ScriptFrame, channel_of};
 use crate::script_result::Result;
+use crate::script_times::{ns, positive_ns};
 
 /// A repetition that a script can change and end.
 #[derive(Clone, Copy, Debug)]
@@ -44,6 +43,10 @@ pub fn register(engine: &mut Engine, runtime: &Rc<Runtime>) {
     values(engine, runtime);
     verdicts(engine, runtime);
     crate::server_functions::register(engine, runtime);
+    crate::fault_functions::register(engine, runtime);
+    crate::file_functions::register(engine, runtime);
+    crate::step_functions::register(engine, runtime);
+    crate::test_functions::register(engine, runtime);
 }
 
 fn sending(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -119,12 +122,10 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
     let of = Rc::clone(runtime);
     engine.register_fn("on_frame", move |ids: &str, call: FnPtr| -> Result<Handle> {
         let selector = selector(&of, ids)?;
-        of.react(|handlers| handlers.on_frame(selector, call)).map(Handle)
+        of.on_frame(selector, call).map(Handle)
     });
     let of = Rc::clone(runtime);
-    engine.register_fn("on_frame", move |call: FnPtr| {
-        of.react(|handlers| handlers.on_frame(Selector::All, call)).map(Handle)
-    });
+    engine.register_fn("on_frame", move |call: FnPtr| of.on_frame(Selector::All, call).map(Handle));
     let of = Rc::clone(runtime);
     engine.register_fn("on_message", move |name: &str, call: FnPtr| -> Result<Handle> {
         let selector = message_selector(&of, name)?;
@@ -168,7 +169,7 @@ fn reacting(engine: &mut Engine, runtime: &Rc<Runtime>) {
         of.after(ns(delay)?, None, call).map(Handle)
     });
     let of = Rc::clone(runtime);
-    engine.register_fn("stop", move |handle: Handle| of.with_handlers(|handlers| handlers.end(handle.0)));
+    engine.register_fn("stop", move |handle: Handle| of.end_reaction(handle.0));
 }
 
 fn waiting(engine: &mut Engine, runtime: &Rc<Runtime>) {
@@ -225,7 +226,7 @@ fn values(engine: &mut Engine, runtime: &Rc<Runtime>) {
     let of = Rc::clone(runtime);
     engine.register_fn("value", move |name: &str| -> Result<Dynamic> {
         let (message, signal) = name.rsplit_once('.').ok_or("write it as Message.Signal")?;
-        let found = of.decoder.messages().find(|(_, _, candidate)| candidate.name == message);
+        let found = of.surroundings.decoder.messages().find(|(_, _, candidate)| candidate.name == message);
         let Some((_, _, found)) = found else { return Err(unknown_message(&of, message).into()) };
         if !found.signals.iter().any(|candidate| candidate.label() == signal) {
             return Err(format!("message {message} has no signal {signal}").into());
@@ -259,54 +260,6 @@ fn verdicts(engine: &mut Engine, runtime: &Rc<Runtime>) {
     engine.register_fn("check", |is_so: bool, what: &str| -> Result<()> {
         if is_so { Ok(()) } else { Err(format!("not so: {what}").into()) }
     });
-    let of = Rc::clone(runtime);
-    engine.register_fn(
-        "run_test",
-        move |context: NativeCallContext<'_>, name: &str, steps: Array| -> Result<()> {
-            let began_ns = of.now_ns();
-            let mut outcome = Outcome::Passed;
-            of.output(Output::TestBegan(name.to_owned()))?;
-            for step in steps {
-                let call: FnPtr = step.try_cast().ok_or("a step of a test is a function")?;
-                // The last step tidies up: it runs whatever happened before.
-                let result = call.call_within_context::<Dynamic>(&context, ());
-                match result {
-                    Err(error) if is_final(&error) => return Err(error),
-                    Err(error) if outcome == Outcome::Passed => outcome = Outcome::Failed(describe(&error)),
-                    _ => {}
-                }
-            }
-            of.output(Output::Test { name: name.to_owned(), outcome, began_ns })
-        },
-    );
-}
-
-/// Whether nothing of a script may run after this.
-fn is_final(error: &rhai::EvalAltResult) -> bool {
-    match error {
-        rhai::EvalAltResult::ErrorTerminated(..) => true,
-        rhai::EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => is_final(inner),
-        _ => false,
-    }
-}
-
-/// An error for people: its reason, and the line where it happened.
-pub fn describe(error: &rhai::EvalAltResult) -> String {
-    match error {
-        rhai::EvalAltResult::ErrorInFunctionCall(_, _, inner, _) => describe(inner),
-        rhai::EvalAltResult::ErrorTerminated(reason, at) | rhai::EvalAltResult::ErrorRuntime(reason, at) => {
-            with_line(&reason.to_string(), *at)
-        }
-        rhai::EvalAltResult::ErrorStackOverflow(at) => with_line(
-            "Stack overflow: too many calls are nested; while a function waits, the others are called, and it again",
-            *at,
-        ),
-        other => other.to_string(),
-    }
-}
-
-fn with_line(reason: &str, at: rhai::Position) -> String {
-    at.line().map_or_else(|| reason.to_owned(), |line| format!("line {line}: {reason}"))
 }
 
 impl Repetition {
@@ -361,11 +314,6 @@ fn bytes_of(values: &Array) -> Result<Vec<u8>> {
     values.iter().map(|value| byte(number(value)?)).collect()
 }
 
-fn channel_of(number: i64) -> Result<Channel> {
-    let channel = u8::try_from(number).ok().and_then(Channel::from_number);
-    channel.ok_or_else(|| format!("there is no channel {number}; there are 1 and 2").into())
-}
-
 /// Identifiers in the grammar of every command, or a message's name.
 fn selector(runtime: &Runtime, text: &str) -> Result<Selector> {
     match text.parse::<IdPattern>() {
@@ -375,18 +323,18 @@ fn selector(runtime: &Runtime, text: &str) -> Result<Selector> {
 }
 
 fn message_selector(runtime: &Runtime, name: &str) -> Result<Selector> {
-    let found = runtime.decoder.messages().find(|(_, _, message)| message.name == name);
+    let found = runtime.surroundings.decoder.messages().find(|(_, _, message)| message.name == name);
     found
         .map(|(reference, _, _)| Selector::Message(reference))
         .ok_or_else(|| unknown_message(runtime, name).into())
 }
 
 fn unknown_message(runtime: &Runtime, name: &str) -> String {
-    if runtime.decoder.messages().next().is_none() {
+    if runtime.surroundings.decoder.messages().next().is_none() {
         return format!("there is no message {name}: give a database with --db");
     }
     // The database's own words for a name that is nearly one of its own.
-    match encode::encode(&runtime.decoder, None, name) {
+    match encode::encode(&runtime.surroundings.decoder, None, name) {
         Err(error) => error.to_string(),
         Ok(_) => format!("there is no message {name}"),
     }
@@ -395,23 +343,11 @@ fn unknown_message(runtime: &Runtime, name: &str) -> String {
 /// A message's frame from values, or the texts of value tables.
 fn encoded(runtime: &Runtime, channel: i64, name: &str, signals: &Map) -> Result<Frame> {
     let channel = channel_of(channel)?;
-    if runtime.decoder.messages().next().is_none() {
+    if runtime.surroundings.decoder.messages().next().is_none() {
         return Err(unknown_message(runtime, name).into());
     }
     let values: Vec<String> = signals.iter().map(|(signal, value)| format!("{signal}={value}")).collect();
     let text = if values.is_empty() { name.to_owned() } else { format!("{name}:{}", values.join(",")) };
-    let encoded = encode::encode(&runtime.decoder, Some(channel.number()), &text);
+    let encoded = encode::encode(&runtime.surroundings.decoder, Some(channel.number()), &text);
     encoded.map(|encoded| encoded.frame).map_err(|error| error.to_string().into())
-}
-
-fn ns(text: &str) -> Result<u64> {
-    grammar::duration(text).map(as_ns).map_err(Into::into)
-}
-
-fn positive_ns(text: &str) -> Result<u64> {
-    grammar::positive_duration(text).map(as_ns).map_err(Into::into)
-}
-
-fn as_ns(duration: Duration) -> u64 {
-    u64::try_from(duration.as_nanos()).unwrap_or(u64::MAX / 2).min(u64::MAX / 2)
 }

@@ -10,8 +10,7 @@ use crate::sheets;
 
 /// No script is larger, in bytes: that of a bus of a thousand identifiers has a tenth of it.
 const MOST_BYTES: u64 = 16 << 20;
-/// What the name of a ready node begins with.
-pub const PREFIX: &str = "node:";
+pub use crate::names::PREFIX;
 
 /// A script that comes with the program.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

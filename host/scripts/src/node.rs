@@ -8,13 +8,15 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 use cantap_can::CHANNELS;
-use cantap_signals::Decoder;
-use rhai::{AST, Engine, Scope};
+use rhai::{AST, ASTNode, Engine, Expr, Scope, Stmt};
 
+use crate::constant_replies::constant_replies;
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::functions;
 use crate::runtime::Runtime;
 use crate::sandbox::{self, ENDED, Operations, STACK_BYTES};
+use crate::script_result::describe;
+use crate::surroundings::Surroundings;
 
 /// The functions whose names begin so are tests.
 const TEST_PREFIX: &str = "test_";
@@ -45,6 +47,12 @@ pub enum ScriptError {
     /// Nothing to run.
     #[error("there is no script to run")]
     None,
+    /// What is to go wrong on the simulated buses cannot.
+    #[error("{reason}")]
+    Fault {
+        /// Why not.
+        reason: String,
+    },
     /// The system gives no thread.
     #[error("{name}: cannot start: {reason}")]
     Thread {
@@ -90,6 +98,19 @@ fn tests_of(ast: &AST, source: &str) -> Vec<String> {
     names
 }
 
+/// Whether a script's text has calls of `test(name, rows, function)`, which make tests when they run.
+fn makes_tests(ast: &AST) -> bool {
+    let mut found = false;
+    ast.walk(&mut |path| {
+        if let Some(ASTNode::Expr(Expr::FnCall(call, _)) | ASTNode::Stmt(Stmt::FnCall(call, _))) = path.last()
+        {
+            found |= call.name == "test" && call.args.len() == 3;
+        }
+        !found
+    });
+    found
+}
+
 /// What follows a script's own text: its `on_start`, then its tests, each between `setup` and `teardown`, or else its functions for as
 /// long as there are any.
 fn tail_of(ast: &AST, source: &str) -> String {
@@ -99,20 +120,20 @@ fn tail_of(ast: &AST, source: &str) -> String {
     if has("on_start") {
         tail.push_str("on_start();\n");
     }
+    let step = |name: &str| if has(name) { format!("Fn(\"{name}\")") } else { String::new() };
+    let (setup, teardown) = (step("setup"), step("teardown"));
     let tests = tests_of(ast, source);
+    // Writing to a text cannot fail.
+    let _ = writeln!(tail, "tests_are_known();");
     for test in &tests {
-        let steps = [("setup", has("setup")), (test, true), ("teardown", has("teardown"))];
-        let steps: Vec<String> = steps
-            .iter()
-            .filter(|(_, is_there)| *is_there)
-            .map(|(name, _)| format!("Fn(\"{name}\")"))
-            .collect();
-        // Writing to a text cannot fail.
-        let _ = writeln!(tail, "run_test(\"{test}\", [{}]);", steps.join(", "));
+        let _ = writeln!(tail, "run_test(\"{test}\", [{setup}], Fn(\"{test}\"), [{teardown}]);");
     }
-    if tests.is_empty() {
-        tail.push_str("serve();\n");
-    }
+    let of_rows = format!("run_tests_of_rows([{setup}], [{teardown}])");
+    let _ = if tests.is_empty() {
+        writeln!(tail, "if !{of_rows} {{ serve(); }}")
+    } else {
+        writeln!(tail, "{of_rows};")
+    };
     tail
 }
 
@@ -120,8 +141,10 @@ fn tail_of(ast: &AST, source: &str) -> String {
 pub struct Node {
     /// Its name.
     pub name: String,
-    /// Its tests, in their order: the run ends with the last one.
+    /// Its tests, in their order, as far as they are known: the run ends with the last one.
     pub tests: Vec<String>,
+    /// Whether its own lines will make more tests.
+    makes_tests: bool,
     /// How many of them have ended.
     pub tests_ended: usize,
     /// When the one after these began, in nanoseconds since the run began.
@@ -130,6 +153,8 @@ pub struct Node {
     pub wake_ns: Option<u64>,
     /// Whether it has ended.
     pub has_ended: bool,
+    /// Whether it has ended because its node has no power, and begins anew later.
+    pub comes_back: bool,
     /// The error with which it has ended.
     pub error: Option<String>,
     inputs: Wanted,
@@ -143,40 +168,33 @@ pub struct Node {
 }
 
 impl Node {
-    /// Starts the `number`th script of a run, from 0, with random numbers of its own.
+    /// Starts the `number`th script of a run, from 0, with random numbers of its own; its first turn is at once.
     pub fn start_nth(
-        number: usize,
+        number: u64,
         script: &Script,
-        decoder: &Arc<Decoder>,
-        seed: u64,
+        surroundings: &Surroundings,
         stop: Arc<AtomicBool>,
     ) -> Result<Self, ScriptError> {
-        Self::start(script, decoder, seed.wrapping_mul(0x9E37_79B9).wrapping_add(number as u64 + 1), stop)
-    }
-
-    /// Starts its thread; its first turn is at once.
-    fn start(
-        script: &Script,
-        decoder: &Arc<Decoder>,
-        seed: u64,
-        stop: Arc<AtomicBool>,
-    ) -> Result<Self, ScriptError> {
-        let tests = script.tests()?;
+        let seed = surroundings.seed.wrapping_mul(0x9E37_79B9).wrapping_add(number).wrapping_add(1);
+        let ast = script.compile(&sandbox::engine(&Operations::default()))?;
         let (to, resume) = sync_channel(1);
         let (turn, from) = sync_channel(1);
-        let (own, decoder, stops) = (script.clone(), Arc::clone(decoder), Arc::clone(&stop));
+        let own = Surroundings { seed, ..surroundings.clone() };
+        let (text, stops) = (script.clone(), Arc::clone(&stop));
         let thread = std::thread::Builder::new()
             .name(format!("script {}", script.name))
             .stack_size(STACK_BYTES)
-            .spawn(move || run(&own, resume, turn, decoder, (seed, stops)))
+            .spawn(move || run(&text, resume, turn, own, &stops))
             .map_err(|error| ScriptError::Thread { name: script.name.clone(), reason: error.to_string() })?;
         Ok(Self {
             name: script.name.clone(),
-            tests,
+            tests: tests_of(&ast, &script.source),
+            makes_tests: makes_tests(&ast),
             tests_ended: 0,
             test_began_ns: None,
             wake_ns: Some(0),
             has_ended: false,
+            comes_back: false,
             error: None,
             inputs: Wanted::default(),
             stop,
@@ -185,6 +203,16 @@ impl Node {
             from,
             thread: Some(thread),
         })
+    }
+
+    /// Whether it has tests, or will have.
+    pub const fn has_tests(&self) -> bool {
+        !self.tests.is_empty() || self.makes_tests
+    }
+
+    /// Whether it has not come to make its tests.
+    pub const fn waits_for_tests(&self) -> bool {
+        self.makes_tests && !self.has_ended
     }
 
     /// Whether it waits for keys.
@@ -220,12 +248,21 @@ impl Node {
         let Turn { outputs, next } = turn.unwrap_or_else(lost);
         for output in &outputs {
             match output {
+                Output::Tests(names) => {
+                    self.tests.extend(names.iter().cloned());
+                    self.makes_tests = false;
+                }
                 Output::TestBegan(_) => self.test_began_ns = Some(now_ns),
                 Output::Test { .. } => {
                     self.tests_ended += 1;
                     self.test_began_ns = None;
                 }
-                Output::Send { .. } | Output::Repeat { .. } | Output::EndRepeat { .. } | Output::Log(_) => {}
+                Output::Send { .. }
+                | Output::Repeat { .. }
+                | Output::EndRepeat { .. }
+                | Output::Reply { .. }
+                | Output::Fault { .. }
+                | Output::Log(_) => {}
             }
         }
         match next {
@@ -260,24 +297,25 @@ fn run(
     script: &Script,
     resume: Receiver<Resume>,
     turn: SyncSender<Turn>,
-    decoder: Arc<Decoder>,
-    (seed, stop): (u64, Arc<AtomicBool>),
+    surroundings: Surroundings,
+    stop: &Arc<AtomicBool>,
 ) {
-    let operations = Operations::until(Arc::clone(&stop));
+    let operations = Operations::until(Arc::clone(stop));
     let settings = script.settings.clone();
-    let runtime = Runtime::new(resume, turn, operations.clone(), decoder, settings, seed);
+    let runtime = Runtime::new(resume, turn, operations.clone(), surroundings, settings);
     let mut engine = sandbox::engine(&operations);
     functions::register(&mut engine, &runtime);
-    let result = runtime.begin().map_err(|error| functions::describe(&error)).and_then(|()| {
+    let result = runtime.begin().map_err(|error| describe(&error)).and_then(|()| {
         let ast = script.compile(&engine).map_err(|error| error.to_string())?;
+        runtime.set_constant_replies(constant_replies(&ast));
         let tail = engine.compile(tail_of(&ast, &script.source)).map_err(|error| error.to_string())?;
         let mut scope = Scope::new();
         operations.begin();
-        engine.run_ast_with_scope(&mut scope, &ast).map_err(|error| functions::describe(&error))?;
+        engine.run_ast_with_scope(&mut scope, &ast).map_err(|error| describe(&error))?;
         // Its own lines have asked for all settings that it knows.
         runtime.settings.check()?;
         let tail = ast.clone_functions_only().merge(&tail);
-        engine.run_ast_with_scope(&mut scope, &tail).map_err(|error| functions::describe(&error))
+        engine.run_ast_with_scope(&mut scope, &tail).map_err(|error| describe(&error))
     });
     let is_stopped = stop.load(Ordering::Relaxed);
     runtime.finish(result.err().filter(|error| error != ENDED && !is_stopped));

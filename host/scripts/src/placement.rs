@@ -2,6 +2,9 @@
 
 use cantap::wire::Hello;
 use cantap::wire::message::capability;
+use cantap_can::Channel;
+
+use crate::device_replies::DeviceReplies;
 
 /// A function with which a script sends, or that calls one that does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -15,6 +18,8 @@ pub enum Statement {
     Timer,
     /// `on_frame` and `on_message`.
     Reaction,
+    /// `on_frame`, if its function only sends a frame that never changes.
+    Reply,
     /// `on_key`.
     Key,
     /// `on_request`, `on_explicit`, `j1939` and `canopen`: they answer by themselves.
@@ -70,6 +75,8 @@ pub enum Target {
         periodic_slots: u8,
         /// Whether it sends at all.
         transmits: bool,
+        /// Replies that it sends by itself, for a script that is alone on it.
+        replies: Option<DeviceReplies>,
     },
 }
 
@@ -90,6 +97,18 @@ impl Target {
             clock: if is_computer { TimedBy::Computer } else { TimedBy::Board },
             periodic_slots: hello.periodic_slots,
             transmits: hello.capabilities & capability::TRANSMIT != 0,
+            replies: None,
+        }
+    }
+
+    /// The same for one script that is alone on the device's only open channel.
+    pub fn alone_on(hello: &Hello, channel: Channel) -> Self {
+        let own = (hello.trigger_slots > 0).then_some(DeviceReplies { channel, slots: hello.trigger_slots });
+        match Self::of(hello) {
+            Self::Device { clock, periodic_slots, transmits, .. } => {
+                Self::Device { clock, periodic_slots, transmits, replies: own }
+            }
+            Self::Simulation => Self::Simulation,
         }
     }
 }
@@ -132,11 +151,23 @@ impl Statement {
     /// Where it runs on a target of which `repeated` frames are repeated already on the channel.
     pub fn place(self, target: Target, repeated: usize) -> Placement {
         let placement = |runner, accuracy: &str| Placement { runner, accuracy: accuracy.to_owned() };
-        let Target::Device { clock, periodic_slots, transmits } = target else {
+        let Target::Device { clock, periodic_slots, transmits, replies } = target else {
             return placement(Runner::Simulation, "exactly, in simulated time");
         };
         if !transmits {
             return placement(Runner::Nothing, "the device sends nothing");
+        }
+        if let (Self::Reply, Some(DeviceReplies { slots, .. })) = (self, replies) {
+            let when = match clock {
+                TimedBy::Board => "within 14 us while the bus is free",
+                TimedBy::Computer => "at once",
+            };
+            return Placement {
+                runner: Runner::Device,
+                accuracy: format!(
+                    "replies by itself, {when}; {slots} filters at once, more from the host, and only one reply of each waits"
+                ),
+            };
         }
         match self {
             Self::Periodic if repeated < usize::from(periodic_slots) => Placement {
@@ -149,10 +180,18 @@ impl Statement {
                     }
                 ),
             },
-            Self::Periodic | Self::Timer => {
-                placement(Runner::Host, "this computer's clock, when the script has its turn")
-            }
-            Self::Reaction => {
+            Self::Periodic => placement(Runner::Host, "when the script has its turn"),
+            Self::Timer => Placement {
+                runner: Runner::Host,
+                accuracy: format!(
+                    "by {}, late by as long as this computer takes to come to it",
+                    match clock {
+                        TimedBy::Board => "the device's clock",
+                        TimedBy::Computer => "this computer's clock",
+                    }
+                ),
+            },
+            Self::Reaction | Self::Reply => {
                 placement(Runner::Host, "when the frame has arrived here and the script has its turn")
             }
             Self::Key => placement(Runner::Host, "when the key has arrived and the script has its turn"),

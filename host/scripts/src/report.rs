@@ -26,6 +26,20 @@ pub struct TestResult {
     pub ended_ns: u64,
     /// The last frames before a failure, each as a line of candump's log format.
     pub trace: Vec<String>,
+    /// What came after it: at most 20 frames, within 100 ms, in the same format.
+    pub trace_after: Vec<String>,
+}
+
+/// What stands between the frames before a failure and those after it.
+pub const FAILED_HERE: &str = "--- failed here ---";
+
+impl TestResult {
+    /// The frames around a failure, with [`FAILED_HERE`] where it was if any came after it.
+    pub fn trace_lines(&self) -> impl Iterator<Item = &str> {
+        let mark = (!self.trace_after.is_empty()).then_some(FAILED_HERE);
+        let [before, after] = [&self.trace, &self.trace_after].map(|lines| lines.iter().map(String::as_str));
+        before.chain(mark).chain(after)
+    }
 }
 
 /// A line that a script logged.
@@ -50,7 +64,7 @@ pub struct Report {
     pub duration_ns: u64,
     /// Frames that the scripts had sent, confirmed by the bus.
     pub frames_sent: u64,
-    /// Those among them that the device repeated by itself.
+    /// Those among them that the device sent by itself: repeated ones and replies.
     pub frames_repeated: u64,
     /// Frames of others, and those of the other scripts.
     pub frames_received: u64,
@@ -120,7 +134,7 @@ impl Report {
                         xml,
                         ">\n      <failure message=\"{}\">{}</failure>\n    </testcase>",
                         escape(reason),
-                        escape(&test.trace.join("\n"))
+                        escape(&test.trace_lines().collect::<Vec<_>>().join("\n"))
                     );
                 }
             }
@@ -170,6 +184,7 @@ mod tests {
             began_ns: 0,
             ended_ns: 1_500_000_000,
             trace: vec!["(0.000001) can0 123#".to_owned()],
+            trace_after: vec!["(0.000002) can0 124#".to_owned()],
         };
         let report = Report {
             tests: vec![
@@ -184,7 +199,7 @@ mod tests {
             "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuites>\n  <testsuite name=\"a.rhai\" tests=\"2\" failures=\"1\" errors=\"0\">\n    \
              <testcase classname=\"a.rhai\" name=\"test_one\" time=\"1.500000\"/>\n    \
              <testcase classname=\"a.rhai\" name=\"test_two\" time=\"1.500000\">\n      \
-             <failure message=\"&lt;\u{FFFD}&quot;&amp;\">(0.000001) can0 123#</failure>\n    </testcase>\n  </testsuite>\n  \
+             <failure message=\"&lt;\u{FFFD}&quot;&amp;\">(0.000001) can0 123#&#10;--- failed here ---&#10;(0.000002) can0 124#</failure>\n    </testcase>\n  </testsuite>\n  \
              <testsuite name=\"b.rhai\" tests=\"1\" failures=\"0\" errors=\"1\">\n    \
              <testcase classname=\"b.rhai\" name=\"b.rhai\">\n      <error message=\"no\"/>\n    </testcase>\n  </testsuite>\n</testsuites>\n"
         );

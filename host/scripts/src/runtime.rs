@@ -1,25 +1,29 @@
 //! A script's thread from inside: its functions call this to send, and to wait for their turn.
 
+mod replies;
+mod tests_of_rows;
+
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::rc::Rc;
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender};
 
 use cantap_can::{CHANNELS, Channel, Frame};
 use cantap_protocols::active::Machine;
-use cantap_signals::{Decoder, MessageRef, Reading, SignalValue};
+use cantap_signals::{MessageRef, Reading, SignalValue};
 use cantap_trace::TraceFrame;
 use rhai::{Dynamic, EvalAltResult, FnPtr, FuncArgs, Map, NativeCallContext};
 
 use crate::exchange::{Input, Next, Output, Resume, Turn, Wanted};
 use crate::handlers::{BusEvent, Handlers, Repeated, Selector};
 use crate::memory;
+use crate::row_test::RowTest;
 use crate::sandbox::{ENDED, Operations};
 use crate::script_frame::ScriptFrame;
 use crate::script_result::Result;
 use crate::servers::{Server, Servers};
 use crate::settings::Settings;
+use crate::surroundings::Surroundings;
 
 /// How many unconfirmed frames a script may have: more are a loop without a wait.
 const MAX_UNCONFIRMED: usize = 4096;
@@ -35,12 +39,14 @@ pub struct Runtime {
     resume: Receiver<Resume>,
     turn: SyncSender<Turn>,
     operations: Operations,
-    /// The databases.
-    pub decoder: Arc<Decoder>,
+    /// What it shares with the others of its run.
+    pub surroundings: Surroundings,
     /// What the user has set for it.
     pub settings: Settings,
     /// What answers for it. Never borrowed while a function of the script runs.
     pub servers: RefCell<Servers>,
+    /// Its functions that only send one constant frame.
+    constant_replies: RefCell<BTreeMap<String, (Channel, Frame)>>,
     state: RefCell<State>,
 }
 
@@ -54,7 +60,12 @@ struct State {
     unconfirmed: [VecDeque<Sender>; CHANNELS],
     /// Its repetitions.
     repeated: BTreeSet<u32>,
+    /// The device's replies that it has, by its handles.
+    replies: BTreeMap<u32, Vec<u8>>,
     random: fastrand::Rng,
+    /// What its own lines have made: tests that have not begun, and whether there can be more.
+    tests: VecDeque<RowTest>,
+    has_all_tests: bool,
 }
 
 /// What of a script sends a frame.
@@ -86,9 +97,8 @@ impl Runtime {
         resume: Receiver<Resume>,
         turn: SyncSender<Turn>,
         operations: Operations,
-        decoder: Arc<Decoder>,
+        surroundings: Surroundings,
         settings: BTreeMap<String, String>,
-        seed: u64,
     ) -> Rc<Self> {
         let state = State {
             now_ns: 0,
@@ -97,15 +107,19 @@ impl Runtime {
             values: BTreeMap::new(),
             unconfirmed: Default::default(),
             repeated: BTreeSet::new(),
-            random: fastrand::Rng::with_seed(seed),
+            replies: BTreeMap::new(),
+            random: fastrand::Rng::with_seed(surroundings.seed),
+            tests: VecDeque::new(),
+            has_all_tests: false,
         };
         Rc::new(Self {
             resume,
             turn,
             operations,
-            decoder,
+            surroundings,
             settings: Settings::new(settings),
             servers: RefCell::default(),
+            constant_replies: RefCell::default(),
             state: RefCell::new(state),
         })
     }
@@ -138,6 +152,11 @@ impl Runtime {
         has_place(self.with_handlers(|handlers| handlers.len()), "functions")?;
         let State { handlers, now_ns, random, .. } = &mut *self.state.borrow_mut();
         Ok(handlers.at(*now_ns + delay_ns, repeated, call, random))
+    }
+
+    /// Counts as so many operations.
+    pub fn spend(&self, cost: usize) {
+        self.operations.spend(cost);
     }
 
     /// Calls `act` with the script's random numbers.
@@ -178,7 +197,12 @@ impl Runtime {
             Output::EndRepeat { handle } => {
                 state.repeated.remove(handle);
             }
-            Output::Log(_) | Output::TestBegan(_) | Output::Test { .. } => {}
+            Output::Reply { .. }
+            | Output::Fault { .. }
+            | Output::Log(_)
+            | Output::Tests(_)
+            | Output::TestBegan(_)
+            | Output::Test { .. } => {}
         }
         state.outputs.push(output);
         Ok(())
@@ -187,7 +211,10 @@ impl Runtime {
     /// Whether nothing of the script can happen any more: it has no function to call, and repeats nothing.
     fn has_nothing_left(&self) -> bool {
         let state = self.state.borrow();
-        state.handlers.is_empty() && state.repeated.is_empty() && self.servers.borrow().is_empty()
+        state.handlers.is_empty()
+            && state.repeated.is_empty()
+            && state.replies.is_empty()
+            && self.servers.borrow().is_empty()
     }
 
     /// The last value of a signal, if it was on the bus.
@@ -309,7 +336,7 @@ impl Runtime {
         let state = self.state.borrow();
         let is_client = matches!(want, Want::Machine(..));
         // With a database, the last value of each signal is kept.
-        let keeps_values = self.decoder.messages().next().is_some();
+        let keeps_values = self.surroundings.decoder.messages().next().is_some();
         let has_servers = !self.servers.borrow().is_empty();
         Wanted {
             frames: keeps_values
@@ -384,7 +411,7 @@ impl Runtime {
             Input::State { channel, state } => self.take_event(context, BusEvent::State(channel, state))?,
             Input::Frame { channel, frame, at_ns } => {
                 let frame = ScriptFrame { channel, frame, at_ns };
-                let message = self.decoder.find(channel.number(), frame.frame.id());
+                let message = self.surroundings.decoder.find(channel.number(), frame.frame.id());
                 let signals = message.map(|message| self.signals_of(&frame, message));
                 if let Want::Machine(machine, of) = want
                     && *of == channel
@@ -435,7 +462,7 @@ impl Runtime {
     /// The values in a frame, which become the last ones of their signals.
     fn signals_of(&self, frame: &ScriptFrame, message: MessageRef) -> Map {
         let mut map = self.decode(frame);
-        let name = &self.decoder.message(message).name;
+        let name = &self.surroundings.decoder.message(message).name;
         let mut state = self.state.borrow_mut();
         for (signal, value) in &map {
             state.values.insert(format!("{name}.{signal}"), value.clone());
@@ -449,10 +476,11 @@ impl Runtime {
     pub fn decode(&self, frame: &ScriptFrame) -> Map {
         let mut values: Vec<SignalValue> = Vec::new();
         let traced = TraceFrame::from(frame.frame);
-        let Some(message) = self.decoder.decode(frame.channel.number(), &traced, &mut values) else {
+        let Some(message) = self.surroundings.decoder.decode(frame.channel.number(), &traced, &mut values)
+        else {
             return Map::new();
         };
-        let message = self.decoder.message(message);
+        let message = self.surroundings.decoder.message(message);
         let readings = values.iter().map(|value| Reading::of(message, value));
         readings
             .map(|reading| {

@@ -4,6 +4,8 @@ use cantap_can::{Channel, Frame};
 use cantap_trace::grammar;
 use rhai::{Blob, Engine};
 
+use crate::script_result::Result;
+
 /// A frame with where and when it was.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ScriptFrame {
@@ -22,9 +24,15 @@ impl ScriptFrame {
     }
 
     /// From can-utils' text, as `123#0102`.
-    pub fn parse(text: &str) -> Result<Self, String> {
+    pub fn parse(text: &str) -> std::result::Result<Self, String> {
         grammar::frame(text).map(Self::new)
     }
+}
+
+/// A channel by its number.
+pub fn channel_of(number: i64) -> Result<Channel> {
+    let channel = u8::try_from(number).ok().and_then(Channel::from_number);
+    channel.ok_or_else(|| format!("there is no channel {number}; there are 1 and 2").into())
 }
 
 /// Makes frames known to an engine.

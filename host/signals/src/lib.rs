@@ -59,6 +59,7 @@ pub use number::{Number, shortest_of_f32};
 pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use reading::Reading;
 pub use select::{Selection, SelectionError, Suggestion};
+pub use sheet::rows_of_text;
 
 /// What the names of databases end with, the usual ones first.
 pub const SUFFIXES: [&str; 8] = ["dbc", "kcd", "sym", "arxml", "dbf", "toml", "xlsx", "csv"];

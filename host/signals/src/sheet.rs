@@ -54,6 +54,12 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     validate::finish(file, messages, faults)
 }
 
+/// The rows of a text whose cells stand between commas, semicolons or tabs, whichever the first rows have most of: each with the line on which it
+/// begins, from 1, and its cells without quotation marks and blanks around them. Empty rows are left out.
+pub fn rows_of_text(text: &str) -> Vec<(u32, Vec<String>)> {
+    rows::of_text(text).rows
+}
+
 /// A sheet with names above its columns.
 struct Table<'a> {
     columns: Columns,

@@ -7,6 +7,7 @@
 mod buffer;
 mod clock;
 mod commands;
+mod device_time;
 mod intake;
 mod pipe;
 mod reader;
@@ -29,6 +30,7 @@ pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
 };
+pub use device_time::DeviceTime;
 pub(crate) use intake::unaccounted;
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
 pub use pipe::{PipeReader, PipeWriter, pipe};
@@ -340,6 +342,11 @@ impl Device {
     /// What is known about the device's clock.
     pub fn clock(&self) -> ClockReport {
         self.shared.published().clock
+    }
+
+    /// The device's time, for whoever needs it often: it is not asked.
+    pub fn device_time(&self) -> DeviceTime {
+        DeviceTime { shared: Arc::clone(&self.shared), tick_hz: self.hello().tick_hz }
     }
 
     /// The current map from the device's time to UTC, with the marks that it is based on. It stays valid for as long as

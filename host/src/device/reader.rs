@@ -54,6 +54,8 @@ pub(super) struct Shared {
     clock_map: Mutex<Option<Arc<ClockMap>>>,
     changed: Condvar,
     subscriber: Mutex<Option<SyncSender<Transmission>>>,
+    /// The computer's clock, to which the device's is mapped.
+    pub utc: UtcClock,
 }
 
 /// A request for the device's time.
@@ -77,6 +79,7 @@ impl Shared {
             clock_map: Mutex::new(None),
             changed: Condvar::new(),
             subscriber: Mutex::new(None),
+            utc: UtcClock::start(),
         }
     }
 
@@ -130,7 +133,7 @@ pub(super) struct Reader {
 
 impl Reader {
     pub fn new(shared: Arc<Shared>, orders: Receiver<Order>) -> Self {
-        let (intake, utc) = (Intake::new(), UtcClock::start());
+        let (intake, utc) = (Intake::new(), shared.utc);
         Self { shared, orders, intake, utc, published: Published::default() }
     }
 

@@ -14,16 +14,10 @@ use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 
-use crate::simbus::Node;
+use crate::simbus::{ErrorCounters, Node};
 
 /// Number of frames that a receive FIFO holds (RM0090 Rev 21 §32.7.3).
 const FIFO_FRAMES: usize = 3;
-/// Error counters at which fault confinement changes (ISO 11898-1:2015, 12.1.4).
-const WARNING: u16 = 96;
-const PASSIVE: u16 = 128;
-const BUS_OFF: u16 = 256;
-/// Bits that a controller waits in bus-off: 128 times 11 recessive ones.
-const RECOVERY_BITS: u64 = 128 * 11;
 
 /// What a controller is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,12 +55,9 @@ pub struct Controller {
     /// Whether the first of `order` is on the bus.
     sending: bool,
     aborting: bool,
-    tec: u16,
-    rec: u16,
+    counters: ErrorCounters,
     error: Option<BusErrorKind>,
     last_error: u32,
-    /// When waiting in bus-off ends, in nanoseconds of model time; set by the machine.
-    recovers_at_ns: Option<u64>,
     /// It was started while bus-off: entering and leaving initialisation mode begins the recovery.
     is_told_to_recover: bool,
     /// Set when something happened, and cleared by the machine.
@@ -92,11 +83,9 @@ impl Controller {
             finished: VecDeque::with_capacity(MAILBOXES),
             sending: false,
             aborting: false,
-            tec: 0,
-            rec: 0,
+            counters: ErrorCounters::default(),
             error: None,
             last_error: 0,
-            recovers_at_ns: None,
             is_told_to_recover: false,
             interrupts: Interrupts::default(),
             heard: 0,
@@ -125,25 +114,21 @@ impl Controller {
         {
             return;
         }
-        let wait_ns = RECOVERY_BITS * 1_000_000_000 / u64::from(self.bitrate_bps.max(1));
-        let at_ns = *self.recovers_at_ns.get_or_insert(now_ns + wait_ns);
-        if now_ns >= at_ns {
-            self.clear_errors();
+        if self.counters.recover(now_ns, self.bitrate_bps) {
+            self.is_told_to_recover = false;
             self.interrupts.error = true;
         }
     }
 
     fn clear_errors(&mut self) {
-        self.tec = 0;
-        self.rec = 0;
-        self.recovers_at_ns = None;
+        self.counters = ErrorCounters::default();
         self.is_told_to_recover = false;
     }
 
     /// Leaves initialisation mode. That does not affect the error counters: only the controller's reset does, and the
     /// sequence that ends bus-off, which begins here (RM0090 Rev 21 §32.7.6).
     fn begin(&mut self) {
-        self.recovers_at_ns = None;
+        self.counters.restart_recovery();
         self.is_told_to_recover = self.state() == ErrorState::BusOff;
         self.phase = Phase::Joining;
     }
@@ -157,12 +142,7 @@ impl Controller {
     }
 
     fn state(&self) -> ErrorState {
-        match self.tec.max(self.rec) {
-            _ if self.tec >= BUS_OFF => ErrorState::BusOff,
-            PASSIVE.. => ErrorState::Passive,
-            WARNING.. => ErrorState::Warning,
-            _ => ErrorState::Active,
-        }
+        self.counters.state()
     }
 
     fn passes(&self, frame: &Frame) -> bool {
@@ -212,14 +192,9 @@ impl Controller {
         self.error = Some(kind);
         self.last_error = error_code(kind);
         self.interrupts.error = true;
-        match self.mode() {
-            // A silent controller's counters do not change.
-            Some(Mode::ListenOnly) | None => {}
-            // A passive sender without an acknowledgement does not count any further (ISO 11898-1:2015,
-            // 12.1.4.2).
-            Some(_) if own && kind == BusErrorKind::Acknowledgment && self.tec >= PASSIVE => {}
-            Some(_) if own => self.tec = (self.tec + 8).min(BUS_OFF),
-            Some(_) => self.rec = (self.rec + 1).min(PASSIVE),
+        // A silent controller's counters do not change.
+        if self.mode().is_some_and(|mode| mode != Mode::ListenOnly) {
+            self.counters.count_error(kind, own);
         }
     }
 }
@@ -266,12 +241,12 @@ impl Node for Controller {
         if own {
             self.sending = false;
             self.aborting = false;
-            self.tec = self.tec.saturating_sub(1);
+            self.counters.count_sent();
             self.finish_first(Outcome::Sent);
         } else {
             // It acknowledges, whatever its filters.
             self.driven += u64::from(self.mode() == Some(Mode::Normal));
-            self.rec = if self.rec > PASSIVE - 1 { PASSIVE - 9 } else { self.rec.saturating_sub(1) };
+            self.counters.count_received();
         }
         if !own || self.is_looped() {
             self.receive_from_bus(frame);
@@ -356,24 +331,21 @@ impl Traffic for TrafficSide {
 
     fn take_errors(&mut self) -> ErrorStatus {
         let mut controller = self.0.borrow_mut();
-        ErrorStatus {
-            kind: controller.error.take(),
-            state: controller.state(),
-            tec: controller.tec.min(255) as u8,
-            rec: controller.rec.min(255) as u8,
-        }
+        let (tec, rec) = controller.counters.values();
+        ErrorStatus { kind: controller.error.take(), state: controller.state(), tec, rec }
     }
 
     fn registers(&self) -> RegisterSet {
         let controller = self.0.borrow();
         let state = controller.state();
+        let (tec, rec) = controller.counters.values();
         // RM0090 Rev 21 §32.9.2; only the parts that this model has.
         let esr = u32::from(state >= ErrorState::Warning)
             | u32::from(state >= ErrorState::Passive) << 1
             | u32::from(state == ErrorState::BusOff) << 2
             | controller.last_error << 4
-            | u32::from(controller.tec.min(255)) << 16
-            | u32::from(controller.rec.min(255)) << 24;
+            | u32::from(tec) << 16
+            | u32::from(rec) << 24;
         let rf0r = controller.fifo.len() as u32 | u32::from(controller.overrun) << 4;
         let stopped = u32::from(controller.phase == Phase::Off);
         let btr = controller.config.map_or(0, |config| {

@@ -56,7 +56,9 @@ impl OnDevice {
         device.join(channel_of, bitrate_bps)?;
         let (orders, received) = channel();
         let (passed, records) = channel();
-        let body = move || run(&device, &Live { decoder, seed: SEED, duration: None }, &received, &passed);
+        let body = move || {
+            run(&device, &Live { decoder, seed: SEED, readable: None, duration: None }, &received, &passed)
+        };
         let thread = std::thread::Builder::new().name("cantap-nodes".to_owned()).spawn(body);
         let thread = thread.map_err(|error| Error::Device(DeviceError::Thread(error)))?;
         Ok(Self { orders: Some(orders), records, thread: Some(thread) })

@@ -100,7 +100,7 @@ impl Scripts {
 
     /// A test has ended.
     pub fn take_test(&mut self, test: &TestResult) {
-        let TestResult { script, name, outcome, began_ns, ended_ns, trace } = test;
+        let TestResult { script, name, outcome, began_ns, ended_ns, .. } = test;
         let milliseconds = (ended_ns - began_ns) as f64 / 1e6;
         let has_passed = *outcome == Outcome::Passed;
         if let Some(row) = self.row(script) {
@@ -115,7 +115,7 @@ impl Scripts {
             }
             Outcome::Failed(reason) => {
                 // The verdict below its frames is in sight.
-                for line in trace {
+                for line in test.trace_lines() {
                     self.say(LineKind::Log, &format!("    {line}"));
                 }
                 let verdict = format!("{script}: FAILED {name} ({milliseconds:.3} ms): {reason}");

@@ -17,7 +17,7 @@ impl Source<'_> {
         let decoder = Arc::clone(lock(self.model).seen.signals.decoder());
         let name = script.name.clone();
         lock(self.model).scripts.begin(&name);
-        let live = Live { decoder, seed: 0, duration: None };
+        let live = Live { decoder, seed: 0, readable: None, duration: None };
         if let Err(error) = self.scripts.start(&live, device, script) {
             lock(self.model).scripts.fail(&name, &error);
         }

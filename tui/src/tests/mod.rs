@@ -171,6 +171,7 @@ fn scripts(scripts: &mut Scripts) {
         began_ns: 0,
         ended_ns: 10_316_000,
         trace: trace.iter().map(ToString::to_string).collect(),
+        trace_after: Vec::new(),
     };
     scripts.take_test(&test("test_speed", Outcome::Passed, &[]));
     let frames = ["(1.000104) can0 7DF#02010D", "(1.000389) can0 7E8#03410D48"];

@@ -2,16 +2,28 @@
 
 use std::io::Write;
 
-use cantap_address::Address;
+use cantap::Channel;
+use cantap_address::{Address, OpenDevice};
 use cantap_scripts::{Explained, Script, Target};
 use cantap_trace::clean;
 use serde_json::json;
 
 /// Prints a line for each statement.
-pub fn explain(scripts: &[Script], device: Option<&Address>, as_json: bool) -> anyhow::Result<()> {
+pub fn explain(
+    scripts: &[Script],
+    device: Option<&Address>,
+    channels: impl Fn(&OpenDevice) -> Vec<Channel>,
+    as_json: bool,
+) -> anyhow::Result<()> {
     let target = match device {
         None => Target::Simulation,
-        Some(address) => Target::of(address.open()?.hello()),
+        Some(address) => {
+            let device = address.open()?;
+            match (scripts, &channels(&device)[..]) {
+                ([_], [channel]) => Target::alone_on(device.hello(), *channel),
+                _ => Target::of(device.hello()),
+            }
+        }
     };
     let mut out = std::io::stdout().lock();
     for script in scripts {

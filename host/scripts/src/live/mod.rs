@@ -5,6 +5,7 @@ mod port;
 mod repeat;
 mod repeated;
 mod run;
+mod run_clock;
 mod settings;
 mod thread;
 mod thread_port;
@@ -21,8 +22,8 @@ pub use settings::{BrokenOff, Live, LiveError};
 pub use thread::ScriptThread;
 
 impl Live {
-    /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's stamps; the
-    /// scripts' own timers follow the computer's clock, and repeated frames the device's.
+    /// Runs scripts on the open channels of a device, which have to be in normal mode to send. Times are those of the device's clock, by which
+    /// scripts have their turns, too, as soon as this computer comes to it; what the device repeats by itself keeps its clock exactly.
     ///
     /// `keys` returns the next key that the user has typed, if there is one; without it, none come.
     ///
@@ -43,6 +44,9 @@ impl Live {
             return Err(broken_off(ScriptError::None.into(), Report::default()));
         }
         let mut run = self.start(device);
+        if let ([_], [(channel, _)]) = (scripts, &device.open_channels()[..]) {
+            run.let_device_reply(*channel, device.hello().trigger_slots);
+        }
         for script in scripts {
             run.add(script).map_err(|error| broken_off(error.into(), Report::default()))?;
         }

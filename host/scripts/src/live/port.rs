@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use cantap::Device;
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
-use cantap::wire::message::Periodic;
+use cantap::wire::message::{Periodic, Trigger};
 use cantap_can::{Channel, Frame};
 
 use super::settings::LiveError;
@@ -38,6 +38,9 @@ pub(super) trait Port {
         slot: u8,
         entry: Option<Periodic>,
     ) -> Result<(), LiveError>;
+
+    /// Sets or clears a reply.
+    fn set_reply(&mut self, channel: Channel, slot: u8, entry: Option<Trigger>) -> Result<(), LiveError>;
 
     /// Waits for what is under way, at most this long.
     fn finish(&mut self, at_most: Duration) -> Result<(), LiveError>;
@@ -89,6 +92,10 @@ impl Port for Direct<'_> {
         entry: Option<Periodic>,
     ) -> Result<(), LiveError> {
         Ok(self.device.set_periodic(channel, slot, entry)?)
+    }
+
+    fn set_reply(&mut self, channel: Channel, slot: u8, entry: Option<Trigger>) -> Result<(), LiveError> {
+        Ok(self.device.set_trigger(channel, slot, entry)?)
     }
 
     fn finish(&mut self, at_most: Duration) -> Result<(), LiveError> {

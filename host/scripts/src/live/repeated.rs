@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use cantap::periodic;
-use cantap::wire::message::Periodic;
+use cantap::wire::message::{Filter, Periodic, Trigger};
 use cantap_can::{Channel, Frame};
 
 use super::repeat::Repeat;
@@ -66,6 +66,39 @@ impl LiveRun<'_> {
             due.push((repeat.of.0, (repeat.channel, repeat.frame)));
         }
         due.into_iter().try_for_each(|(place, frame)| self.send_of(place, frame, false))
+    }
+
+    /// A reply of the device, for a script.
+    pub(super) fn set_reply(
+        &mut self,
+        place: usize,
+        (channel, slot): (Channel, u8),
+        entry: Option<(Filter, Frame)>,
+    ) -> Result<(), LiveError> {
+        let key = (channel.index(), slot);
+        if entry.is_some() {
+            self.replies.insert(key, place);
+            self.replied.insert(key, place);
+        } else {
+            self.replies.remove(&key);
+        }
+        let entry = entry.map(|(filter, reply)| Trigger { filter, reply, count: 0 });
+        self.port.set_reply(channel, slot, entry)
+    }
+
+    /// The device does not reply any more for scripts that have ended.
+    pub(super) fn end_replies(&mut self, is_meant: impl Fn(usize) -> bool) -> Result<(), LiveError> {
+        let meant = self.replies.extract_if(.., |_, place| is_meant(*place)).map(|(key, _)| key);
+        let meant: Vec<(usize, u8)> = meant.collect();
+        meant
+            .into_iter()
+            .try_for_each(|(channel, slot)| self.port.set_reply(Channel::ALL[channel], slot, None))
+    }
+
+    /// Ends everything that the device does for scripts, as far as it is still there.
+    pub(super) fn end_all(&mut self) {
+        let _ = self.end_replies(|_| true);
+        let _ = self.end_repeats(|_, _| true);
     }
 
     pub(super) fn end_repeats(&mut self, is_meant: impl Fn(usize, u32) -> bool) -> Result<(), LiveError> {

@@ -3,25 +3,28 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use cantap::device::Records;
-use cantap::device::Transmission;
+use cantap::device::{DeviceTime, Transmission};
 use cantap::wire::Hello;
-use cantap::wire::message::TRIGGER_TAG;
+use cantap::wire::message::{TRIGGER_TAG, capability};
 use cantap::{Device, TraceEvent, TraceRecord};
 use cantap_can::{CHANNELS, Channel, DEVICE_TAG, Frame};
-use cantap_signals::Decoder;
 use cantap_trace::{Direction, TraceFrame};
 
 use super::port::{Direct, Port};
 use super::repeat::Repeat;
+use super::run_clock::RunClock;
 use super::settings::{Live, LiveError};
+use crate::device_replies::DeviceReplies;
 use crate::exchange::{Input, Output};
+use crate::files::GrantedFiles;
 use crate::node::{Node, Script, ScriptError};
 use crate::placement::Target;
 use crate::report::{Message, Report};
 use crate::results::{Results, is_over};
+use crate::surroundings::Surroundings;
 
 /// The longest wait for records: Ctrl-C is seen after it.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -36,28 +39,42 @@ impl Live {
     /// The same for a caller that has the device's records itself and hands them over between turns, and adds scripts as it likes.
     /// [`Self::duration`] is its business.
     pub fn start<'d>(&self, device: &'d Device) -> LiveRun<'d> {
-        self.start_through(Box::new(Direct::new(device)), device.hello())
+        self.start_through(Box::new(Direct::new(device)), device.hello(), device.device_time())
     }
 
     /// The same through anything that leads to a device.
-    pub(super) fn start_through<'d>(&self, port: Box<dyn Port + 'd>, hello: &Hello) -> LiveRun<'d> {
+    pub(super) fn start_through<'d>(
+        &self,
+        port: Box<dyn Port + 'd>,
+        hello: &Hello,
+        device_time: DeviceTime,
+    ) -> LiveRun<'d> {
+        // An adapter's clock is this computer's.
+        let has_clock = hello.capabilities & capability::ADAPTER == 0;
+        let device_time = has_clock.then_some(device_time);
         LiveRun {
             port,
-            decoder: Arc::clone(&self.decoder),
-            seed: self.seed,
+            surroundings: Surroundings {
+                decoder: Arc::clone(&self.decoder),
+                seed: self.seed,
+                files: Arc::new(GrantedFiles::under(self.readable.clone())),
+                replies: None,
+                nodes: None,
+            },
             nodes: Vec::new(),
             under_way: BTreeMap::new(),
             ended: Default::default(),
             repeated: BTreeMap::new(),
             dropped: Vec::new(),
             slots: BTreeMap::new(),
+            replies: BTreeMap::new(),
+            replied: BTreeMap::new(),
             repeats: Vec::new(),
             target: Target::of(hello),
             periodic_slots: hello.periodic_slots,
             tick_hz: hello.tick_hz,
             results: Results::default(),
-            began: Instant::now(),
-            first_ns: None,
+            clock: RunClock::start(device_time),
             now_ns: 0,
             stamp_ns: 0,
         }
@@ -74,8 +91,7 @@ pub struct LiveRun<'d> {
     pub(super) periodic_slots: u8,
     /// The rate of the device's clock.
     pub(super) tick_hz: u32,
-    decoder: Arc<Decoder>,
-    seed: u64,
+    surroundings: Surroundings,
     nodes: Vec<Node>,
     /// Whose frame a tag is, and whether the script waits to see it confirmed.
     under_way: BTreeMap<(usize, u32), (usize, bool)>,
@@ -87,12 +103,14 @@ pub struct LiveRun<'d> {
     dropped: Vec<(usize, Channel)>,
     /// The device's slot of each repetition, by channel, script and handle.
     pub(super) slots: BTreeMap<(usize, usize, u32), u8>,
+    /// Whose each of the device's replies is, by channel and slot.
+    pub(super) replies: BTreeMap<(usize, u8), usize>,
+    /// The same of those that have ended, too.
+    pub(super) replied: BTreeMap<(usize, u8), usize>,
     /// What is repeated from here, because the device has no more slots.
     pub(super) repeats: Vec<Repeat>,
     results: Results,
-    began: Instant,
-    /// The stamp that is the run's time zero, and when it came.
-    first_ns: Option<i64>,
+    clock: RunClock,
     pub(super) now_ns: u64,
     /// The time of the last record: it may be before the present turn's.
     stamp_ns: u64,
@@ -115,12 +133,11 @@ impl LiveRun<'_> {
                 _ => break,
             }
         }
-        // However short the run is.
-        if keys.is_none() {
-            self.results.without_keys(&self.nodes, self.now_ns);
-        }
-        while duration.is_none_or(|duration| self.began.elapsed() < duration) && !self.is_over() && goes_on()
-        {
+        let is_wanted = |run: &Self| !run.is_over() || run.results.is_tracing(run.now_ns);
+        let is_in_time = |run: &mut Self| {
+            duration.is_none_or(|duration| u128::from(run.clock.now_ns()) < duration.as_nanos())
+        };
+        while is_in_time(self) && is_wanted(self) && goes_on() {
             match &mut keys {
                 Some(keys) => std::iter::from_fn(keys).try_for_each(|key| self.key(key))?,
                 None => self.results.without_keys(&self.nodes, self.now_ns),
@@ -134,7 +151,16 @@ impl LiveRun<'_> {
             }
             self.results.messages.drain(..).for_each(&mut *on_message);
         }
+        // However short the run was: before their first turn, scripts wait for nothing.
+        if keys.is_none() {
+            self.results.without_keys(&self.nodes, self.now_ns);
+        }
         Ok(())
+    }
+
+    /// The device may reply in place of scripts on its only open channel, on which there is only one.
+    pub(super) const fn let_device_reply(&mut self, channel: Channel, slots: u8) {
+        self.surroundings.replies = Some(DeviceReplies { channel, slots });
     }
 
     /// One more node, from now on; returns its place.
@@ -147,7 +173,7 @@ impl LiveRun<'_> {
 
     /// The same; it ends when `stop` becomes true, also in the middle of a computation.
     pub(super) fn add_until(&mut self, script: &Script, stop: Arc<AtomicBool>) -> Result<usize, ScriptError> {
-        self.nodes.push(Node::start_nth(self.nodes.len(), script, &self.decoder, self.seed, stop)?);
+        self.nodes.push(Node::start_nth(self.nodes.len() as u64, script, &self.surroundings, stop)?);
         Ok(self.nodes.len() - 1)
     }
 
@@ -159,6 +185,7 @@ impl LiveRun<'_> {
         if let Some(node) = self.nodes.get_mut(place) {
             node.end();
         }
+        self.end_replies(|of| of == place)?;
         self.end_repeats(|of, _| of == place)
     }
 
@@ -217,7 +244,8 @@ impl LiveRun<'_> {
     /// # Errors
     /// If the device is gone, or refused something.
     pub fn turn(&mut self) -> Result<Duration, LiveError> {
-        self.pass_time(self.began.elapsed().as_nanos() as u64);
+        let now_ns = self.clock.now_ns();
+        self.pass_time(now_ns);
         for place in 0..self.nodes.len() {
             if self.nodes[place].wake_ns.is_some_and(|wake_ns| wake_ns <= self.now_ns) {
                 self.resume(place, None)?;
@@ -264,11 +292,10 @@ impl LiveRun<'_> {
     /// As [`Self::turn`].
     pub fn take_record(&mut self, record: TraceRecord) -> Result<TraceRecord, LiveError> {
         let Some(channel) = Channel::from_number(record.channel) else { return Ok(record) };
-        let now_ns = self.began.elapsed().as_nanos() as u64;
-        let first_ns = *self.first_ns.get_or_insert(record.time_ns - now_ns as i64);
-        self.stamp_ns = u64::try_from(record.time_ns - first_ns).unwrap_or(0);
-        // Its way here may have been shorter than that of the first.
-        self.pass_time(self.stamp_ns.min(now_ns));
+        let (stamp_ns, now_ns) = self.clock.stamp_ns(&record);
+        self.stamp_ns = stamp_ns;
+        // By what is known of the device's clock, it may be yet to come.
+        self.pass_time(stamp_ns.min(now_ns));
         match record.event {
             TraceEvent::Frame { frame, direction: Direction::Tx, late } => {
                 let is_callers = self.take_sent(channel, frame)?;
@@ -385,8 +412,10 @@ impl LiveRun<'_> {
         if let Some(sender) = self.under_way.get(&(channel.index(), tag)) {
             return Some(*sender);
         }
-        let slot = u8::try_from(tag.checked_sub(DEVICE_TAG)?).ok()?;
-        self.repeated.get(&(channel.index(), slot)).map(|place| (*place, false))
+        let slot = |first: u32| u8::try_from(tag.checked_sub(first)?).ok();
+        let repeated = slot(DEVICE_TAG).and_then(|slot| self.repeated.get(&(channel.index(), slot)));
+        let replied = slot(TRIGGER_TAG).and_then(|slot| self.replied.get(&(channel.index(), slot)));
+        repeated.or(replied).map(|place| (*place, false))
     }
 
     fn sent(&mut self, channel: Channel, tag: u32, frame: Frame) {
@@ -409,7 +438,7 @@ impl LiveRun<'_> {
             match self.results.take(&name, self.now_ns, output) {
                 // What it sent before its error, without a wait, it sent at the same moment.
                 Some(Output::Send { .. }) if has_failed => self.results.report.frames_not_sent += 1,
-                Some(Output::Repeat { .. }) if has_failed => {}
+                Some(Output::Repeat { .. } | Output::Reply { entry: Some(_), .. }) if has_failed => {}
                 Some(Output::Send { channel, frame }) => self.send_of(place, (channel, frame), true)?,
                 Some(Output::Repeat { handle, channel, frame, period_ns }) => {
                     self.repeat_of(place, (handle, channel), frame, period_ns)?;
@@ -417,10 +446,22 @@ impl LiveRun<'_> {
                 Some(Output::EndRepeat { handle }) => {
                     self.end_repeats(|of, own| (of, own) == (place, handle))?;
                 }
-                Some(Output::Log(_) | Output::TestBegan(_) | Output::Test { .. }) | None => {}
+                Some(Output::Reply { channel, slot, entry }) => {
+                    self.set_reply(place, (channel, slot), entry)?;
+                }
+                // The first is refused to scripts on a device.
+                Some(
+                    Output::Fault { .. }
+                    | Output::Log(_)
+                    | Output::Tests(_)
+                    | Output::TestBegan(_)
+                    | Output::Test { .. },
+                )
+                | None => {}
             }
         }
         if self.nodes[place].has_ended {
+            self.end_replies(|of| of == place)?;
             self.end_repeats(|of, _| of == place)?;
         }
         Ok(())
@@ -448,7 +489,7 @@ impl LiveRun<'_> {
     /// Ends everything that the scripts began, as far as the device is still there.
     /// And returns how it went, and what was logged last.
     pub fn finish(mut self) -> (Report, Vec<Message>) {
-        let _ = self.end_repeats(|_, _| true);
+        self.end_all();
         let _ = self.port.finish(FAREWELL);
         // Their records are not waited for, and the scripts have had their last turn.
         let _ = self.collect_ended();
@@ -476,7 +517,6 @@ impl LiveRun<'_> {
 
 impl Drop for LiveRun<'_> {
     fn drop(&mut self) {
-        // As far as the device is still there.
-        let _ = self.end_repeats(|_, _| true);
+        self.end_all();
     }
 }

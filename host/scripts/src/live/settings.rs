@@ -1,5 +1,6 @@
 //! What a run on a device needs, and why it breaks off.
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -16,6 +17,8 @@ pub struct Live {
     pub decoder: Arc<Decoder>,
     /// Selects another sequence of random numbers; each script has its own.
     pub seed: u64,
+    /// The folder of which scripts may read the files; none for no files at all.
+    pub readable: Option<PathBuf>,
     /// When the run ends, since its beginning; scripts with tests end it earlier.
     pub duration: Option<Duration>,
 }

@@ -69,9 +69,10 @@ impl ScriptThread {
         let (request, requests) = channel();
         let shared = Arc::<Shared>::default();
         let (live, hello, both) = (live.clone(), device.hello().clone(), Arc::clone(&shared));
+        let time = device.device_time();
         let body = move || {
             let port = ThreadPort::new(request.clone(), Arc::clone(&both));
-            let mut run = live.start_through(Box::new(port), &hello);
+            let mut run = live.start_through(Box::new(port), &hello, time);
             if let Err(error) = serve(&mut run, &passed, &request, &both) {
                 // If nobody waits for it, the scripts were ended from outside.
                 let _ = request.send(Request::Broken(error));

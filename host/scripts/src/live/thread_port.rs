@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use cantap::device::Transmission;
-use cantap::wire::message::Periodic;
+use cantap::wire::message::{Periodic, Trigger};
 use cantap_can::{Channel, DEVICE_TAG, Frame};
 
 use super::events::ScriptEvent;
@@ -130,6 +130,11 @@ impl Port for ThreadPort {
         entry: Option<Periodic>,
     ) -> Result<(), LiveError> {
         self.request(Request::Periodic { of, channel, slot, entry })
+    }
+
+    fn set_reply(&mut self, _: Channel, _: u8, _: Option<Trigger>) -> Result<(), LiveError> {
+        // Scripts beside others have no replies of the device: see [`super::run::LiveRun::let_device_reply`].
+        Ok(())
     }
 
     fn finish(&mut self, _: Duration) -> Result<(), LiveError> {

@@ -175,6 +175,48 @@ fn keys_are_typed_at_their_times_and_a_script_for_which_none_come_is_named() {
     assert!(failure(&report).contains("\"ab\" is not one key"), "{report:?}");
 }
 
+#[test]
+fn steps_are_played_with_their_waits_and_jumps() {
+    let source = r#"
+        play([
+            #{ send: "100#", wait: "5ms" },
+            #{ name: "ramp", channel: 2, send: frame("200#01"), wait: "10ms" },
+            #{ name: "inner", run: || log("inner") },
+            #{ jump: "inner", times: 1 },
+            #{ jump: "ramp", times: 2 },
+            #{ send: "101#" },
+        ]);
+        log("done");
+    "#;
+    let (report, records, lines) = run(1, &[script("a", source)]);
+    assert!(report.is_success(), "{report:?}");
+    let frames: Vec<(i64, String)> = records
+        .iter()
+        .map(|record| (record.time_ns / 1_000_000, record.frame().unwrap().to_string()))
+        .collect();
+    let frames: Vec<(i64, &str)> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
+    assert_eq!(frames, [(0, "100#"), (5, "200#01"), (15, "200#01"), (25, "200#01"), (35, "101#")]);
+    assert_eq!(lines.iter().filter(|line| line.ends_with("inner")).count(), 6);
+    assert_eq!(report.duration_ns / 1_000_000, 35);
+    for (steps, reason) in [
+        ("#{ name: \"a\" }, #{ jump: \"a\" }", "no time passed"),
+        ("#{ name: \"a\", wait: \"0s\", jump: \"a\" }", "no time passed"),
+        ("#{ name: \"a\", send: \"1#\", jump: \"a\" }", "no time passed"),
+        ("#{ jump: \"b\" }", "no step \"b\""),
+        ("#{ name: 1 }, #{ name: 1 }", "two steps have the name 1"),
+        ("#{ sent: \"1#\" }", "a step has no sent"),
+        ("#{ times: 3 }", "times is for a jump"),
+        ("5", "a step is a map"),
+    ] {
+        let (report, _, _) = run(1, &[script("a", &format!("play([{steps}]);"))]);
+        assert!(failure(&report).contains(reason), "{steps}: {report:?}");
+    }
+    // With a wait it goes on for as long as the run does.
+    let (report, records, _) =
+        run(1, &[script("a", "play([#{ name: \"a\", send: \"1#\", wait: \"10ms\", jump: \"a\" }]);")]);
+    assert!(report.is_success() && records.len() == 100, "{} {report:?}", records.len());
+}
+
 /// A run that was over too soon says nothing of a test: that is no success.
 #[test]
 fn a_test_that_has_not_ended_with_the_run_has_failed() {

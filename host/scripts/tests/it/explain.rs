@@ -3,11 +3,12 @@
 use std::time::Duration;
 
 use cantap::Channel;
-use cantap_scripts::{Explained, Live, Report, Runner, Target, TimedBy};
+use cantap_scripts::{DeviceReplies, Explained, Live, Report, Runner, Target, TimedBy};
 
 use super::{decoder, script};
 
-const BOARD: Target = Target::Device { clock: TimedBy::Board, periodic_slots: 32, transmits: true };
+const BOARD: Target =
+    Target::Device { clock: TimedBy::Board, periodic_slots: 32, transmits: true, replies: None };
 
 fn explain(source: &str, target: Target) -> Vec<Explained> {
     script("a.rhai", source).explain(target).unwrap()
@@ -25,7 +26,7 @@ fn both(source: &str) -> (Vec<Explained>, Report) {
     let said = explain(source, Target::of(device.hello()));
     let asker =
         script("asker", r#"wait("20ms"); send("7E0#023E00"); send("18EA00F9#00EE00"); wait("300ms");"#);
-    let live = Live { decoder: decoder(), seed: 1, duration: Some(Duration::from_secs(5)) };
+    let live = Live { decoder: decoder(), seed: 1, readable: None, duration: Some(Duration::from_secs(5)) };
     let scripts = [script("a.rhai", source), asker];
     let before = live.run(&device, &scripts[1..], &mut |_| {}, &mut |_| {}, None, &mut || true).unwrap();
     let mut report = live.run(&device, &scripts, &mut |_| {}, &mut |_| {}, None, &mut || true).unwrap();
@@ -72,7 +73,7 @@ fn more_repeated_frames_than_the_device_takes_come_from_here() {
             .accuracy
             .ends_with(&format!("; {slots} at once on each channel, more from the host"))
     );
-    let live = Live { decoder: decoder(), seed: 1, duration: Some(Duration::from_secs(1)) };
+    let live = Live { decoder: decoder(), seed: 1, readable: None, duration: Some(Duration::from_secs(1)) };
     let mut ids = std::collections::BTreeMap::<u32, u32>::new();
     let mut count = |record: cantap::TraceRecord| {
         if let Some(frame) = record.frame() {
@@ -129,8 +130,36 @@ fn test_it() { request(\"7E0\", \"7E8\", [1]); log(1); expect(\"7E8\", \"1s\"); 
 }
 
 #[test]
+fn constant_replies_of_a_script_that_is_alone_are_the_device_s() {
+    let alone = |slots: u8| Target::Device {
+        clock: TimedBy::Board,
+        periodic_slots: 32,
+        transmits: true,
+        replies: Some(DeviceReplies { channel: Channel::Can1, slots }),
+    };
+    let source = "
+on_frame(\"7E0\", |f| send(\"7E8#01\"));
+on_frame(\"7E0\", |f| send(2, \"7E8#01\"));
+on_frame(\"001-7FE\", |f| { send(\"7E8#01\"); });
+on_frame(|f| send(1, \"7E8#01\"));
+on_frame(\"7E0\", |f| send(frame(0x7E8, f.data)));
+";
+    let (device, host) = (Runner::Device, Runner::Host);
+    let found = |target| -> Vec<Runner> {
+        runners(source, target).into_iter().map(|(_, _, runner)| runner).collect()
+    };
+    // Each function, and what stands in it.
+    assert_eq!(found(alone(8)), [device, device, host, host, host, host, device, device, host, host]);
+    assert_eq!(found(alone(1))[6], host, "two lengths of identifiers are two replies");
+    assert!(found(BOARD).iter().all(|runner| *runner == host));
+    let said = &explain(source, alone(8))[0].placement.accuracy;
+    assert!(said.starts_with("replies by itself, within 14 us"), "{said}");
+}
+
+#[test]
 fn a_device_that_sends_nothing_and_simulated_buses_are_said_to_be_such() {
-    let mute = Target::Device { clock: TimedBy::Computer, periodic_slots: 0, transmits: false };
+    let mute =
+        Target::Device { clock: TimedBy::Computer, periodic_slots: 0, transmits: false, replies: None };
     let source = "periodic(\"1#\", \"1s\"); send(\"1#\");";
     let all = |runner| vec![(1, "periodic".to_owned(), runner), (1, "send".to_owned(), runner)];
     assert_eq!(runners(source, mute), all(Runner::Nothing));

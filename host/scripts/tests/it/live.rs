@@ -15,7 +15,7 @@ fn device(options: &str) -> Device {
 }
 
 fn run(device: &Device, scripts: &[Script], duration: Option<Duration>) -> Report {
-    let live = Live { decoder: decoder(), seed: 1, duration };
+    let live = Live { decoder: decoder(), seed: 1, readable: None, duration };
     live.run(device, scripts, &mut |_| {}, &mut |_| {}, None, &mut || true).unwrap()
 }
 
@@ -65,7 +65,7 @@ fn a_device_that_vanishes_is_an_error_and_not_a_hang() {
         r#"every("1ms", || send("100#")); fn test_a() { log("a"); } fn test_b() { log("b"); wait("1h"); }"#;
     let is_in_b = Cell::new(false);
     let mut turns = 0;
-    let live = Live { decoder: decoder(), seed: 1, duration: None };
+    let live = Live { decoder: decoder(), seed: 1, readable: None, duration: None };
     let mut on_message = |message: Message| is_in_b.set(is_in_b.get() || message.text == "b");
     let broken = live.run(&device, &[script("a", source)], &mut |_| {}, &mut on_message, None, &mut || {
         turns += u32::from(is_in_b.get());
@@ -119,13 +119,107 @@ fn a_script_does_not_hear_itself_and_a_node_keeps_its_address() {
     assert_eq!((report.frames_sent, report.frames_received), (1, 0), "{report:?}");
 }
 
+/// A device with other nodes on its bus that send these frames on channel 1 at these times, in milliseconds.
+fn device_with(frames: &[(u64, &str)]) -> Device {
+    let mut options: cantap_virtual::Options = "load=0".parse().unwrap();
+    let entries = frames.iter().map(|(at_ms, frame)| (at_ms * 1_000_000, frame.parse().unwrap()));
+    options.log = Some([entries.collect(), Vec::new()]);
+    let device = cantap_virtual::open(options).unwrap();
+    device.join(Channel::Can1, 500_000).unwrap();
+    device
+}
+
+/// As a device's own replies: within microseconds, and none is left when the function, or the run, has ended.
+#[test]
+fn a_constant_reply_of_a_script_that_is_alone_is_the_device_s_own() {
+    let asked: Vec<(u64, &str)> = (1..=20).map(|n| (n * 100, "7E0#0101")).collect();
+    let device = device_with(&asked);
+    let source = r#"
+        let n = 0;
+        let reply = on_frame("7E0", |f| send("7E8#01"));
+        on_frame("7E0", |f| { n += 1; if n == 5 { stop(reply); } });
+        on_frame("7E0", |f| send(frame("6E8", [n])));
+    "#;
+    let live =
+        Live { decoder: decoder(), seed: 1, readable: None, duration: Some(Duration::from_millis(1500)) };
+    let mut records = Vec::<TraceRecord>::new();
+    let report = live
+        .run(
+            &device,
+            &[script("a", source)],
+            &mut |record| records.push(record),
+            &mut |_| {},
+            None,
+            &mut || true,
+        )
+        .unwrap();
+    assert!(report.is_success(), "{report:?}");
+    let ends = |text: &str| -> Vec<u64> {
+        let of =
+            records.iter().filter(|record| record.frame().is_some_and(|frame| frame.to_string() == text));
+        of.map(|record| record.device_ns.unwrap().get()).collect()
+    };
+    let (asked, replied) = (ends("7E0#0101"), ends("7E8#01"));
+    assert!((5..=10).contains(&replied.len()) && asked.len() > replied.len(), "{asked:?} {replied:?}");
+    assert_eq!(report.frames_repeated, replied.len() as u64);
+    assert!(report.frames_sent > report.frames_repeated, "{report:?}");
+    for replied in &replied {
+        let asked = asked.iter().rfind(|asked| *asked < replied).unwrap();
+        // Three bits of pause, and the reply's 58 with its stuff bits.
+        assert!((100_000..140_000).contains(&(replied - asked)), "{asked} {replied}");
+    }
+    let again = run(&device, &[script("idle", "wait(\"500ms\");")], None);
+    assert_eq!((again.frames_sent, again.frames_received > 0), (0, true), "{again:?}");
+    // A script that ends with an error leaves none either, nor does one of two have any: a device does not answer itself.
+    let fails = "on_frame(\"7E0\", |f| send(\"7E8#01\")); wait(\"1ms\"); fail(\"no\");";
+    let after = "wait(\"300ms\");";
+    let device = device_with(&[(400, "7E0#"), (500, "7E0#"), (600, "7E0#")]);
+    let report = run(&device, &[script("a", fails)], None);
+    assert_eq!(failure(&report), "line 1: no");
+    let before = device.status().unwrap().channels[0].transmitted;
+    run(&device, &[script("idle", after), script("idle 2", after)], None);
+    assert_eq!(device.status().unwrap().channels[0].transmitted, before);
+}
+
+/// By the computer's clock, a second of this device is 0.5 ms shorter.
+#[test]
+fn the_times_of_a_run_are_those_of_the_device_s_clock() {
+    let device = device("load=0,ppm=500");
+    let sender = script("sender", "periodic(\"100#01\", \"50ms\");");
+    let listener = script(
+        "listener",
+        r#"
+        fn test_times() {
+            let first = expect("100", "5s").time;
+            for n in 1..41 {
+                let f = expect("100", "5s");
+                let off = f.time - first - n * 0.05;
+                check(off.abs() < 0.000005, `frame ${n} is off by ${off} s`);
+                check(now() > f.time - 0.001, `it came at ${now()}, before it was there at ${f.time}`);
+            }
+        }
+        "#,
+    );
+    let report = run(&device, &[sender, listener], Some(Duration::from_mins(1)));
+    assert!(report.is_success(), "{report:?}");
+}
+
+#[test]
+fn nothing_goes_wrong_on_purpose_on_a_device() {
+    let device = device("load=0");
+    for call in ["power_off(\"a\")", "error_burst(\"1ms\")", "lose(3)", "stall(\"1ms\")", "bus_off(\"a\")"] {
+        let report = run(&device, &[script("a", &format!("{call};"))], None);
+        assert!(failure(&report).contains("only on simulated buses"), "{call}: {report:?}");
+    }
+}
+
 /// A listener beside a script that sends and traffic of other nodes: what it hears is what the trace has, in its order, with its times.
 #[test]
 fn a_script_hears_the_frames_of_the_trace_in_their_order_and_with_their_stamps() {
     let device = device("load=20");
     let sender = script("sender", r#"periodic("7F0#01", "3ms"); every("2ms", || send("7F1#02"));"#);
     let listener = script("listener", r#"on_frame(|f| log(f.to_string() + " " + f.time));"#);
-    let live = Live { decoder: decoder(), seed: 1, duration: Some(Duration::from_secs(1)) };
+    let live = Live { decoder: decoder(), seed: 1, readable: None, duration: Some(Duration::from_secs(1)) };
     let (mut records, mut heard) = (Vec::<TraceRecord>::new(), Vec::new());
     let report = live
         .run(
@@ -138,10 +232,10 @@ fn a_script_hears_the_frames_of_the_trace_in_their_order_and_with_their_stamps()
         )
         .unwrap();
     assert!(report.is_success(), "{report:?}");
-    let frames: Vec<(i64, String)> = records
+    let frames: Vec<(u64, String)> = records
         .iter()
         .filter_map(|record| match record.event {
-            TraceEvent::Frame { frame, .. } => Some((record.time_ns, frame.to_string())),
+            TraceEvent::Frame { frame, .. } => Some((record.device_ns.unwrap().get(), frame.to_string())),
             _ => None,
         })
         .collect();
@@ -156,7 +250,7 @@ fn a_script_hears_the_frames_of_the_trace_in_their_order_and_with_their_stamps()
     let first = (0..frames.len()).find(begins).unwrap();
     let frames = &frames[first..];
     let out_of_place = heard.iter().zip(frames).filter(|((_, heard), (_, frame))| heard != frame).count();
-    let error = |((time, _), (time_ns, _)): (&(f64, &str), &(i64, String))| {
+    let error = |((time, _), (time_ns, _)): (&(f64, &str), &(u64, String))| {
         (time - heard[0].0 - (time_ns - frames[0].0) as f64 / 1e9).abs()
     };
     let worst = heard.iter().zip(frames).map(error).fold(0.0, f64::max);

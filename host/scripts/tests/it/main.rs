@@ -2,16 +2,18 @@
 
 mod bench;
 mod explain;
+mod faults;
 mod hostile;
 mod library;
 mod live;
+mod tables;
 mod thread;
 mod twin;
 
 use std::alloc::System;
 use std::sync::Arc;
 
-use cantap_scripts::{Bench, Counting, Outcome, Report, Script};
+use cantap_scripts::{Bench, BenchBus, Counting, Outcome, Report, Script};
 use cantap_signals::{Decoder, Source};
 use cantap_trace::TraceRecord;
 
@@ -36,12 +38,15 @@ fn script(name: &str, source: &str) -> Script {
 }
 
 fn bench(options: &str, seconds: u64) -> Bench {
+    let BenchBus { options, faults } = options.parse().unwrap();
     Bench {
-        options: options.parse().unwrap(),
+        options,
+        faults,
         bitrates_bps: [500_000; 2],
         decoder: decoder(),
         seed: 1,
         keys: Vec::new(),
+        readable: None,
         duration_ns: seconds * SECOND_NS,
     }
 }

@@ -22,7 +22,7 @@ impl Owner {
     fn new(options: &str, scripts: &[Script]) -> Self {
         let device = cantap_virtual::open(options.parse().unwrap()).unwrap();
         device.join(Channel::Can1, 500_000).unwrap();
-        let live = Live { decoder: decoder(), seed: 1, duration: None };
+        let live = Live { decoder: decoder(), seed: 1, readable: None, duration: None };
         let mut thread = ScriptThread::start(&live, &device).unwrap();
         for (place, script) in scripts.iter().enumerate() {
             assert_eq!(thread.add(script.clone()).unwrap(), place);
@@ -113,7 +113,11 @@ fn a_script_that_is_ended_repeats_and_answers_nothing_any_more() {
     thread.finish(Some(&device));
     let owner = Owner {
         records: device.records(),
-        thread: ScriptThread::start(&Live { decoder: decoder(), seed: 1, duration: None }, &device).unwrap(),
+        thread: ScriptThread::start(
+            &Live { decoder: decoder(), seed: 1, readable: None, duration: None },
+            &device,
+        )
+        .unwrap(),
         device,
         trace: Vec::new(),
         events: Vec::new(),

@@ -27,6 +27,10 @@ pub trait Node {
     fn acknowledges(&self) -> bool;
     /// Whether its error flags destroy other nodes' frames that it cannot read.
     fn destroys(&self) -> bool;
+    /// Whether the frame that it sends is destroyed, whatever else happens.
+    fn is_disturbed(&self) -> bool {
+        false
+    }
     /// Its frame has won arbitration: it cannot be withdrawn any more.
     fn on_start(&mut self);
     /// Its frame has lost to a lower identifier.
@@ -58,6 +62,8 @@ pub struct SimBus {
     error_percent: f64,
     /// How many of the controllers' next frames to destroy.
     disturbed: u32,
+    /// Whatever begins before this time is destroyed.
+    burst_until_ns: u64,
     random: fastrand::Rng,
     phase: Phase,
     /// Since when nobody has listened, so that the simulated nodes are silent.
@@ -76,6 +82,7 @@ impl SimBus {
             others_acknowledge: true,
             error_percent: 0.0,
             disturbed: 0,
+            burst_until_ns: 0,
             random: fastrand::Rng::with_seed(seed),
             phase: Phase::Free { from_ns: 0 },
             silent_from_ns: None,
@@ -114,6 +121,13 @@ impl SimBus {
     #[must_use]
     pub fn disturbing(self, frames: u32) -> Self {
         Self { disturbed: frames, ..self }
+    }
+
+    /// Destroys every frame that begins before this time, whoever sends it: an error burst.
+    pub const fn destroy_until(&mut self, until_ns: u64) {
+        if until_ns > self.burst_until_ns {
+            self.burst_until_ns = until_ns;
+        }
     }
 
     /// When something happens next; `u64::MAX` if nothing will before a node changes.
@@ -184,7 +198,7 @@ impl SimBus {
         let bits = FrameBits::of(&frame);
         let at = |bits: u64| now_ns + bits * 1_000_000_000 / u64::from(bitrate_bps.max(1));
         let whole = u64::from(bits.total() - INTERMISSION_BITS);
-        let error = self.fate(sender, bitrate_bps, nodes);
+        let error = self.fate(sender, (now_ns, bitrate_bps), nodes);
         let (end, free) = match error {
             None => (whole, whole + u64::from(INTERMISSION_BITS)),
             Some(BusErrorKind::Acknowledgment) => {
@@ -206,12 +220,18 @@ impl SimBus {
     fn fate(
         &mut self,
         sender: Option<usize>,
-        bitrate_bps: u32,
+        (now_ns, bitrate_bps): (u64, u32),
         nodes: &[&mut dyn Node],
     ) -> Option<BusErrorKind> {
+        const SEEN_BY_OTHERS: [BusErrorKind; 3] =
+            [BusErrorKind::Stuff, BusErrorKind::Form, BusErrorKind::Crc];
+        const SEEN_BY_SENDERS: [BusErrorKind; 2] = [BusErrorKind::BitDominant, BusErrorKind::BitRecessive];
+        if now_ns < self.burst_until_ns || sender.is_some_and(|index| nodes[index].is_disturbed()) {
+            let kinds: &[BusErrorKind] = if sender.is_some() { &SEEN_BY_SENDERS } else { &SEEN_BY_OTHERS };
+            return Some(kinds[self.random.usize(..kinds.len())]);
+        }
         if sender.is_none() && self.error_percent > 0.0 && self.random.f64() * 100.0 < self.error_percent {
-            const KINDS: [BusErrorKind; 3] = [BusErrorKind::Stuff, BusErrorKind::Form, BusErrorKind::Crc];
-            return Some(KINDS[self.random.usize(..KINDS.len())]);
+            return Some(SEEN_BY_OTHERS[self.random.usize(..SEEN_BY_OTHERS.len())]);
         }
         if let (Some(_), Some(left)) = (sender, self.disturbed.checked_sub(1)) {
             self.disturbed = left;

@@ -4,6 +4,7 @@
 //! disturb each other in mid-frame. Its edges are derived from the frames, for watching a pin. A seed makes everything deterministic.
 
 mod bus;
+mod confinement;
 mod frames;
 mod traffic;
 mod waveform;
@@ -11,6 +12,7 @@ mod waveform;
 #[cfg(feature = "nodes")]
 pub(crate) use bus::arbitration_field;
 pub use bus::{Node, SimBus};
+pub use confinement::ErrorCounters;
 pub use frames::{FrameSource, Frames, UnknownFrames};
 pub use traffic::{Schedule, Senders, Traffic};
 pub use waveform::Edge;

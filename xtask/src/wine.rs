@@ -1,5 +1,7 @@
 //! `cargo xtask ci --only windows`: the command built for Windows and run under Wine, beside the one of this system.
 
+mod makers;
+
 use std::io::{BufRead, BufReader};
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -11,6 +13,7 @@ use xshell::{Shell, cmd};
 
 use crate::machine::Machine;
 use crate::outcome::Outcome;
+use crate::tests;
 use crate::toolchain::{self, Toolchain};
 use crate::workspace;
 
@@ -47,13 +50,14 @@ pub fn check(machine: &Machine) -> Result<Outcome> {
         .env("CARGO_PROFILE_DEV_DEBUG", "0")
         .args(["-p", "cantap-cli", "--no-default-features", "--features", FEATURES])
         .run()?;
-    cmd!(shell, "cargo build -p cantap-cli --all-features").run()?;
+    // With another selection of packages, other people's crates would be compiled again.
+    tests::build(shell)?;
     let windows = Windows::prepare(shell, &target)?;
     windows.captures_and_converts(shell)?;
     windows.captures_from_a_port(shell)?;
     windows.is_ended_by_ctrl_c(shell)?;
     windows.writes_into_a_named_pipe(shell)?;
-    windows.loads_makers_libraries(shell)?;
+    windows.uses_makers_libraries(shell)?;
     Ok(Outcome::Passed)
 }
 
@@ -97,10 +101,7 @@ impl Windows {
 
     fn line(&self, line: &str) -> Command {
         println!("$ wine cantap.exe {line}");
-        let mut command = self.command("cantap.exe", &line.split(' ').collect::<Vec<_>>());
-        // What the makers' libraries that stand in for theirs are to do.
-        command.env("STANDIN", "talks");
-        command
+        self.command("cantap.exe", &line.split(' ').collect::<Vec<_>>())
     }
 
     /// What it records is what this system reads, and both write the same bytes of it.
@@ -189,66 +190,6 @@ impl Windows {
         capture.wait()?;
         ensure!(wait(reader)?.status.success(), "the pipe's reader failed");
         says(&self.summary(shell, "piped.pcapng")?, " on 2 channels, 0 lost, 0 errors")
-    }
-
-    /// PEAK's and Kvaser's libraries, as DLLs made from what stands in for them in the adapters' tests: found in the system's folder, not in the
-    /// current one, and by their paths.
-    fn loads_makers_libraries(&self, shell: &Shell) -> Result<()> {
-        let sources = workspace::root().join("host/adapters/tests/stand_in");
-        let system = self.prefix.join("drive_c/windows/system32");
-        for (source, dll, kind, other) in [
-            ("pcanbasic", "PCANBasic.dll", "pcan", "pcan:?data-bitrate=2M"),
-            ("canlib", "canlib32.dll", "kvaser", "kvaser:0"),
-        ] {
-            let (here, there) = (self.folder.join(dll), system.join(dll));
-            shell.remove_path(&there)?;
-            let code = sources.join(source).with_extension("c");
-            cmd!(shell, "{COMPILER} -shared -O1 -Wall -Wextra -Werror -static -o {here} {code} -lpthread")
-                .run()?;
-            let capture = format!("capture -b 500k -n 100 -o {kind}.log --force -d");
-            let refused = ends_well(self.line(&format!("{capture} {kind}:")))
-                .map_or_else(|error| error.to_string(), |_| String::new());
-            says(&refused, &format!("{dll} cannot be loaded"))?;
-            // Wine's drive Z is the root.
-            let path = here.display().to_string().replace('/', r"\");
-            self.cantap(&format!(r"{capture} {kind}:?library=Z:{path}"))?;
-            self.has_talked(&format!("{kind}.log"), false)?;
-            shell.copy_file(&here, &there)?;
-            let list = self.cantap("list")?;
-            says(&list, &format!("{kind}:"))?;
-            self.cantap(&format!("{capture} {kind}:"))?;
-            self.has_talked(&format!("{kind}.log"), false)?;
-            self.cantap(&format!("{capture} {other}"))?;
-            self.has_talked(&format!("{kind}.log"), other.contains("data-bitrate"))?;
-            self.cantap(&format!("send -d {kind}: -b 500k 123#0102 1ABCDEF0#0102030405060708"))?;
-            shell.remove_path(&there)?;
-        }
-        Ok(())
-    }
-
-    /// Whether a log has what the libraries say: a hundred frames, one each millisecond by the adapter's stamps.
-    fn has_talked(&self, log: &str, is_fd: bool) -> Result<()> {
-        let text = std::fs::read_to_string(self.folder.join(log))?;
-        let expected = (0..100u32).map(|number| {
-            let id = if number % 2 == 0 {
-                format!("{:03X}", 0x100 + number)
-            } else {
-                format!("{:08X}", 0x18DA_0000 + number)
-            };
-            let (mark, len) = if is_fd { ("##1", 64) } else { ("#", number as usize % 9) };
-            format!("{id}{mark}{}", format!("{number:02X}").repeat(len))
-        });
-        let words = |line: &str| line.split(' ').map(str::to_owned).collect::<Vec<_>>();
-        let lines: Vec<Vec<String>> = text.lines().map(words).filter(|words| words.len() == 3).collect();
-        let frames: Vec<&str> = lines.iter().map(|words| words[2].as_str()).collect();
-        ensure!(frames == expected.collect::<Vec<_>>(), "{log}:\n{text}");
-        let time = |words: &[String]| words[0].trim_matches(['(', ')']).parse::<f64>();
-        let took = time(&lines[99])? - time(&lines[0])?;
-        ensure!(
-            (0.097..0.101).contains(&took),
-            "{log}: a hundred milliseconds, by the adapter's stamps, are {took} s"
-        );
-        Ok(())
     }
 
     /// The first line that this system's statistics have to say.

@@ -81,7 +81,7 @@ fn make_ascii(buffer: &mut Buffer) {
             symbol if symbol.is_ascii() => continue,
             "─" | "–" => "-",
             "━" => "=",
-            "●" => "o",
+            "●" | "°" => "o",
             "◆" => "B",
             "│" | "╵" => "|",
             "Δ" => "d",
@@ -92,7 +92,6 @@ fn make_ascii(buffer: &mut Buffer) {
             "↓" => "v",
             "×" => "x",
             "µ" => "u",
-            "°" => "o",
             // A point after a digit would be a decimal one.
             "…" => "~",
             "•" => "*",

@@ -14,7 +14,7 @@ const HEAD_BYTES: u64 = 24;
 /// Blocks that one list names.
 const IN_A_LIST: usize = 4096;
 
-fn head(name: &[u8; 4], links: u64, len: u64) -> Vec<u8> {
+fn head(name: [u8; 4], links: u64, len: u64) -> Vec<u8> {
     let mut head = name.to_vec();
     head.extend([0; 4]);
     head.extend((HEAD_BYTES + 8 * links + len).to_le_bytes());
@@ -41,7 +41,7 @@ pub fn in_blocks(from: &Path, to: &Path, block_bytes: u64) -> Result<usize> {
     let (mut at, mut blocks) = (data, Vec::new());
     while left > 0 {
         let len = left.min(block_bytes);
-        out.write_all(&head(b"##DT", 0, len))?;
+        out.write_all(&head(*b"##DT", 0, len))?;
         ensure!(std::io::copy(&mut from.by_ref().take(len), &mut out)? == len, "the file is too short");
         blocks.push(at);
         let filled = (HEAD_BYTES + len).next_multiple_of(8);
@@ -58,7 +58,7 @@ pub fn in_blocks(from: &Path, to: &Path, block_bytes: u64) -> Result<usize> {
         at += HEAD_BYTES + 8 * links + fields.len() as u64;
         let is_last = (place + 1) * IN_A_LIST >= blocks.len();
         let next = if is_last { 0 } else { at };
-        out.write_all(&head(b"##DL", links, fields.len() as u64))?;
+        out.write_all(&head(*b"##DL", links, fields.len() as u64))?;
         for link in std::iter::once(&next).chain(list) {
             out.write_all(&link.to_le_bytes())?;
         }

@@ -40,8 +40,8 @@ pub(super) trait Usb: Send {
 
 /// An open adapter.
 pub(super) struct UsbAdapter {
-    commands: [(Endpoint<Bulk, Out>, Endpoint<Bulk, In>); 2],
-    messages: [(Endpoint<Bulk, Out>, Endpoint<Bulk, In>); 2],
+    commands: [Pair; 2],
+    messages: [Pair; 2],
 }
 
 impl UsbAdapter {
@@ -57,11 +57,10 @@ impl UsbAdapter {
     }
 }
 
-fn pair(
-    interface: &Interface,
-    number: u8,
-    address: &str,
-) -> Result<(Endpoint<Bulk, Out>, Endpoint<Bulk, In>), OpenError> {
+/// To a channel, and from it.
+type Pair = (Endpoint<Bulk, Out>, Endpoint<Bulk, In>);
+
+fn pair(interface: &Interface, number: u8, address: &str) -> Result<Pair, OpenError> {
     let failed = |error| KIND.failed(&error, address);
     let out = interface.endpoint::<Bulk, Out>(number).map_err(failed)?;
     let input = interface.endpoint::<Bulk, In>(number | IN).map_err(failed)?;

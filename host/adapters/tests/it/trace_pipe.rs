@@ -109,7 +109,7 @@ fn halves_endless_lines_zeros_and_absurd_stamps_cost_what_they_are_and_hold_up_n
     assert_eq!((frames(&records), losses(&records)), (vec!["124#".to_owned()], vec![]));
     // Longer than any line that is kept, without and with an end.
     for _ in 0..10 {
-        pipe.write_all(&[b'x'; 1 << 20]).unwrap();
+        pipe.write_all(&vec![b'x'; 1 << 20]).unwrap();
     }
     pipe.write_all(b"\n(1700000000.001000) can0 125#\n").unwrap();
     let records = until_frame(&device, "125#");

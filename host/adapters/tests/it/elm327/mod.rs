@@ -242,7 +242,7 @@ impl StandIn {
     /// It prints this, and monitors no more.
     fn ends(&self, text: &str) {
         self.state.lock().unwrap().monitors = false;
-        self.port.says(&format!("{text}\r\r>"));
+        self.port.says(format!("{text}\r\r>"));
     }
 
     /// Waits until it monitors again.

@@ -168,7 +168,7 @@ impl<'a, 'i> Reader<'a, 'i> {
             self.instance(loader, instance, &mut layer.services);
         }
         for records in variant.descendants().filter(|node| node.has_tag_name("RECORDDT")) {
-            layer.dops.push(self.trouble_codes(loader, records));
+            layer.dops.push(trouble_codes(loader, records));
         }
         loader.model.layers.push(layer);
         loader.model.layers.len() as u32 - 1
@@ -304,21 +304,17 @@ impl<'a, 'i> Reader<'a, 'i> {
             }
         }
     }
+}
 
-    fn trouble_codes(&self, loader: &mut Loader, records: Node<'a, 'i>) -> u32 {
-        let codes = children(records, "RECORD").filter_map(|record| {
-            let code = u32::try_from(integer(record.attribute("v")?)?).ok()?;
-            // Its text says all that there is.
-            Some((code, OdxDtc { name: translated(record, "TEXT"), ..OdxDtc::default() }))
-        });
-        let bits = child(records, "CVALUETYPE").and_then(|value| number(value, "bl")).unwrap_or(24);
-        let dtcs = Dtcs {
-            coded: constant(bits),
-            compu: Compu::Identical,
-            codes: codes.collect(),
-            others: Vec::new(),
-        };
-        loader.model.dops.push(Dop { name: qualifier(records), kind: DopKind::Dtcs(Box::new(dtcs)) });
-        loader.model.dops.len() as u32 - 1
-    }
+fn trouble_codes(loader: &mut Loader, records: Node<'_, '_>) -> u32 {
+    let codes = children(records, "RECORD").filter_map(|record| {
+        let code = u32::try_from(integer(record.attribute("v")?)?).ok()?;
+        // Its text says all that there is.
+        Some((code, OdxDtc { name: translated(record, "TEXT"), ..OdxDtc::default() }))
+    });
+    let bits = child(records, "CVALUETYPE").and_then(|value| number(value, "bl")).unwrap_or(24);
+    let dtcs =
+        Dtcs { coded: constant(bits), compu: Compu::Identical, codes: codes.collect(), others: Vec::new() };
+    loader.model.dops.push(Dop { name: qualifier(records), kind: DopKind::Dtcs(Box::new(dtcs)) });
+    loader.model.dops.len() as u32 - 1
 }

@@ -134,11 +134,12 @@ fn scale(comp: Node<'_, '_>) -> CompuScale {
     let read = |name: &str, default: f64| {
         comp.attribute(name).and_then(|text| text.trim().parse().ok()).unwrap_or(default)
     };
-    let (factor, offset, divisor): (f64, f64, f64) = (read("f", 1.0), read("o", 0.0), read("div", 1.0));
-    let (numerator, denominator) = if divisor == 1.0 {
-        (vec![offset, factor], Vec::new())
-    } else {
+    let (factor, offset) = (read("f", 1.0), read("o", 0.0));
+    let (numerator, denominator) = if comp.has_attribute("div") {
+        let divisor: f64 = read("div", 1.0);
         (vec![offset * divisor, factor], vec![divisor])
+    } else {
+        (vec![offset, factor], Vec::new())
     };
     CompuScale { low: limit(comp, "s"), high: limit(comp, "e"), numerator, denominator, constant: None }
 }

@@ -21,12 +21,12 @@ pub struct Attached {
     /// Its frames are destroyed until it is bus-off.
     is_disturbed: bool,
     /// What it has seen since it was last asked, in order.
-    seen: Vec<Seen>,
+    seen: Vec<Sighting>,
 }
 
 /// What a controller sees of its bus, with its transmit and receive error counters after it.
 #[derive(Clone, Copy, Debug)]
-pub enum Seen {
+pub enum Sighting {
     /// A frame ended well.
     Frame(Frame, Whose),
     /// One was destroyed.
@@ -72,7 +72,7 @@ impl Attached {
         dropped
     }
 
-    pub fn take_seen(&mut self) -> Vec<Seen> {
+    pub fn take_seen(&mut self) -> Vec<Sighting> {
         std::mem::take(&mut self.seen)
     }
 
@@ -111,7 +111,7 @@ impl Attached {
         let state = self.counters.state();
         if state != self.state {
             self.state = state;
-            self.seen.push(Seen::State(state, self.counters.values()));
+            self.seen.push(Sighting::State(state, self.counters.values()));
             self.is_disturbed &= state != ErrorState::BusOff;
         }
     }
@@ -157,14 +157,14 @@ impl BusNode for Attached {
         } else {
             self.counters.count_received();
         }
-        self.seen.push(Seen::Frame(*frame, whose));
+        self.seen.push(Sighting::Frame(*frame, whose));
         self.note_state();
     }
 
     fn on_error(&mut self, kind: BusErrorKind, own: bool) {
         self.is_sending &= !own;
         self.counters.count_error(kind, own);
-        self.seen.push(Seen::Error(kind, self.counters.values()));
+        self.seen.push(Sighting::Error(kind, self.counters.values()));
         self.note_state();
     }
 

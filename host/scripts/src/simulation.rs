@@ -1,6 +1,6 @@
 //! Scripts on simulated buses, step by step.
 
-mod faults;
+mod injection;
 mod wire;
 
 use std::collections::VecDeque;
@@ -10,7 +10,7 @@ use cantap_can::{CHANNELS, Channel, Frame, LossStage};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 use cantap_virtual::simbus::SimBus;
 
-use crate::attached::{Attached, Seen, Whose};
+use crate::attached::{Attached, Sighting, Whose};
 use crate::exchange::{Input, Output};
 use crate::faults::{BenchNodes, PlannedFault};
 use crate::intake::{Intake, Losses, Taken};
@@ -261,7 +261,7 @@ impl Simulation {
         wire.with(|bus, nodes| bus.step(now_ns, nodes));
         let mut is_lost = false;
         for seen in wire.own.take_seen() {
-            if let Seen::Frame(frame, whose) = seen {
+            if let Sighting::Frame(frame, whose) = seen {
                 self.results.frame(now_ns, channel, frame);
                 is_lost = whose == Whose::Others && self.losses.take(now_ns);
             }
@@ -270,27 +270,27 @@ impl Simulation {
         for place in 0..self.nodes.len() {
             for seen in self.buses[channel.index()].nodes[place].take_seen() {
                 match seen {
-                    Seen::Frame(frame, Whose::Others) => self.arrive(place, channel, frame, is_lost),
-                    Seen::Frame(_, whose) => {
+                    Sighting::Frame(frame, Whose::Others) => self.arrive(place, channel, frame, is_lost),
+                    Sighting::Frame(_, whose) => {
                         self.results.report.frames_sent += 1;
                         if whose == Whose::Own {
                             self.hand(place, Input::Sent { channel });
                         }
                     }
-                    Seen::Error(kind, _) => self.hand(place, Input::Error { channel, kind: Some(kind) }),
-                    Seen::State(state, _) => self.hand(place, Input::State { channel, state }),
+                    Sighting::Error(kind, _) => self.hand(place, Input::Error { channel, kind: Some(kind) }),
+                    Sighting::State(state, _) => self.hand(place, Input::State { channel, state }),
                 }
             }
         }
     }
 
     /// Something that the caller's controller has seen.
-    fn record(&mut self, channel: Channel, seen: Seen, is_lost: bool) {
+    fn record(&mut self, channel: Channel, seen: Sighting, is_lost: bool) {
         let now_ns = self.now_ns;
         let record =
             |event| TraceRecord { time_ns: now_ns as i64, device_ns: None, channel: channel.number(), event };
         let event = match seen {
-            Seen::Frame(frame, Whose::Others) => {
+            Sighting::Frame(frame, Whose::Others) => {
                 let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
                 let stage = match self.intake.take_frame(now_ns, record(event), is_lost) {
                     Taken::Now(record) => return self.records.push(record),
@@ -307,13 +307,13 @@ impl Simulation {
                 }
                 TraceEvent::Lost { stage: Some(stage), count: 1, at_least: false }
             }
-            Seen::Frame(frame, _) => {
+            Sighting::Frame(frame, _) => {
                 TraceEvent::Frame { frame: frame.into(), direction: Direction::Tx, late: false }
             }
-            Seen::Error(kind, counters) => {
+            Sighting::Error(kind, counters) => {
                 TraceEvent::BusError { kind: Some(kind), counters: Some(counters) }
             }
-            Seen::State(state, counters) => TraceEvent::State { state, counters: Some(counters) },
+            Sighting::State(state, counters) => TraceEvent::State { state, counters: Some(counters) },
         };
         let taken = self.intake.take_other(now_ns, record(event));
         self.records.extend(taken);

@@ -124,13 +124,14 @@ mod tests {
 
     #[test]
     fn a_channel_may_have_a_bit_rate_of_its_own() {
-        let line = Line::try_parse_from("x -b 500k -b 2:250k -b 1M".split(' ')).unwrap();
+        let line = Line::try_parse_from("x -b 1M -b 2:250k".split(' ')).unwrap();
         let rate = |channel| match line.timing.options().request(channel).unwrap() {
             Some(TimingRequest::Rate { bitrate_bps, .. }) => bitrate_bps,
             other => panic!("{other:?}"),
         };
-        // As with any option given twice, the last one counts.
         assert_eq!((rate(Channel::Can1), rate(Channel::Can2)), (1_000_000, 250_000));
+        // A wrong rate disturbs a bus: of two, none is taken.
+        assert!(timing("-b 500k -b 2:250k -b 1M").is_err_and(|reason| reason.contains("500000")));
         let line = Line::try_parse_from("x -b 2:250k".split(' ')).unwrap();
         assert_eq!(line.timing.options().request(Channel::Can1).unwrap(), None);
     }

@@ -33,7 +33,7 @@ const ON_THE_WAY: Duration = Duration::from_millis(500);
                   show how their clocks relate. Each only listens unless --mode says otherwise; at least one node on the bus must acknowledge.\n\n\
                   Examples:\n  \
                   cantap compare-adapters -d /dev/ttyACM0 -d can0 -b 500k\n  \
-                  cantap compare-adapters -d /dev/ttyACM0 -d elm327:/dev/rfcomm0 -b 500k -t 60s --json\n\n\
+                  cantap compare-adapters -d COM3 -d elm327:COM4 -b 500k -t 60s --json\n\n\
                   Exit code 3: one of the two missed a frame, has one more often than the other, or has them in another order. \
                   1: one received nothing, or they have nothing in common that occurs only once."
 )]

@@ -77,6 +77,17 @@ impl ErrorState {
     /// All of them, from the best to the worst.
     pub const ALL: [Self; 4] = [Self::Active, Self::Warning, Self::Passive, Self::BusOff];
 
+    /// The state that follows from the transmit and the receive error counter of a controller that is on the bus. Never [`BusOff`](Self::BusOff): the
+    /// counters are told as bytes, which do not reach 256.
+    pub const fn of_counters(transmit: u8, receive: u8) -> Self {
+        let greater = if transmit > receive { transmit } else { receive };
+        match greater {
+            0..96 => Self::Active,
+            96..128 => Self::Warning,
+            128.. => Self::Passive,
+        }
+    }
+
     /// Its name in texts, JSON and tables.
     pub const fn name(self) -> &'static str {
         match self {
@@ -111,6 +122,20 @@ impl ErrorState {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn either_counter_makes_the_state_worse() {
+        for (count, state) in [
+            (0, ErrorState::Active),
+            (95, ErrorState::Active),
+            (96, ErrorState::Warning),
+            (127, ErrorState::Warning),
+            (128, ErrorState::Passive),
+            (255, ErrorState::Passive),
+        ] {
+            assert_eq!([ErrorState::of_counters(count, 0), ErrorState::of_counters(0, count)], [state; 2]);
+        }
+    }
 
     #[test]
     fn every_name_is_that_of_one() {

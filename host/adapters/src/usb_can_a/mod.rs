@@ -152,11 +152,7 @@ impl UsbCanA {
             Message::State { transmit, receive } => {
                 self.tells_state = true;
                 // Nothing says whether it is off the bus.
-                let state = match transmit.max(receive) {
-                    0..=95 => ErrorState::Active,
-                    96..=127 => ErrorState::Warning,
-                    128.. => ErrorState::Passive,
-                };
+                let state = ErrorState::of_counters(transmit, receive);
                 self.errors.set(state, Some((transmit, receive)), channel, at, &mut self.backlog);
             }
             Message::FixedFrame => self.end(

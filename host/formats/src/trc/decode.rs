@@ -333,12 +333,7 @@ impl Decoder {
                 }
             }
             (b"EC", [rec, tec, ..]) => {
-                let state = match tec.max(rec) {
-                    128.. => ErrorState::Passive,
-                    96.. => ErrorState::Warning,
-                    _ => ErrorState::Active,
-                };
-                TraceEvent::State { state, counters: Some((*tec, *rec)) }
+                TraceEvent::State { state: ErrorState::of_counters(*tec, *rec), counters: Some((*tec, *rec)) }
             }
             (b"EV", _) => return Ok(Row::LeftOut("comments and texts")),
             _ => return Err(wrong()),

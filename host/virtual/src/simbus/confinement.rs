@@ -3,7 +3,6 @@
 use cantap_wire::record::{BusErrorKind, ErrorState};
 
 /// Error counters at which fault confinement changes.
-const WARNING: u16 = 96;
 const PASSIVE: u16 = 128;
 const BUS_OFF: u16 = 256;
 /// Bits that a controller waits in bus-off: 128 times 11 recessive ones.
@@ -30,12 +29,11 @@ impl ErrorCounters {
 
     /// The state that follows from them.
     pub fn state(&self) -> ErrorState {
-        match self.transmit.max(self.receive) {
-            _ if self.transmit >= BUS_OFF => ErrorState::BusOff,
-            PASSIVE.. => ErrorState::Passive,
-            WARNING.. => ErrorState::Warning,
-            _ => ErrorState::Active,
+        if self.transmit >= BUS_OFF {
+            return ErrorState::BusOff;
         }
+        let (transmit, receive) = self.values();
+        ErrorState::of_counters(transmit, receive)
     }
 
     /// A frame of the controller's own was sent.

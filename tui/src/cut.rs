@@ -1,22 +1,11 @@
-//! Text that does not fit ends in `…`: a number that is cut must not look like a smaller one.
+//! Lines that do not fit end in `…`, as [texts](cantap_work::cut) do.
 
+use cantap_work::cut::MARK;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
-
-/// At the end of what was cut.
-const MARK: &str = "…";
-
-/// A text in at most this many characters.
-pub fn cut(text: &str, columns: usize) -> String {
-    if text.chars().count() <= columns {
-        return text.to_owned();
-    }
-    let kept = text.chars().take(columns.saturating_sub(1));
-    kept.chain(MARK.chars()).take(columns).collect()
-}
 
 /// A line in at most this many columns.
 pub fn cut_line(line: Line<'static>, columns: usize) -> Line<'static> {
@@ -51,7 +40,6 @@ mod tests {
 
     #[test]
     fn what_is_cut_says_so() {
-        assert_eq!([3, 2, 1, 0].map(|columns| cut("255", columns)), ["255", "2…", "…", ""]);
         let line = Line::from(vec![Span::raw("Speed "), Span::raw("255")]);
         let cut = |columns| cut_line(line.clone(), columns).to_string();
         assert_eq!([cut(9), cut(8), cut(6), cut(1), cut(0)], ["Speed 255", "Speed 2…", "Speed…", "…", ""]);

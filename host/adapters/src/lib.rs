@@ -43,6 +43,8 @@ mod slcan;
 mod socketcan;
 mod socketcand;
 mod source;
+#[cfg(test)]
+mod testing;
 mod text_lines;
 mod trace_pipe;
 mod under_way;

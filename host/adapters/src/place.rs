@@ -198,7 +198,10 @@ impl FromStr for Place {
                 Kind::Trace { path: rest.to_owned(), format }
             }
             "candump" | "pcapng" => return Err(bad("name the pipe, as in candump:- for standard input")),
-            _ => return Err(bad("it is no CAN interface's name, and begins with none of socketcan:, gs_usb:, slcan:, usb-can-a:, canalyst-ii:, gvret:, pcan:, kvaser:, elm327:, stn:, socketcand:, cannelloni:, candump:, pcapng:")),
+            _ => {
+                let schemes = SCHEMES.join(", ");
+                return Err(BadPlace(format!("it is no CAN interface's name, and begins with none of {schemes}")));
+            }
         };
         Ok(Self { text: text.to_owned(), kind })
     }

@@ -46,7 +46,6 @@ pub(crate) fn is_head(bytes: &[u8]) -> bool {
 /// What stands behind a byte.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Item {
-    Head,
     Frame,
     Time,
     Mark,
@@ -55,7 +54,6 @@ enum Item {
 impl Item {
     fn of(first: u8, version: Version) -> Option<Self> {
         match (first, version) {
-            (b'C', _) => Some(Self::Head),
             (0xCF, Version::V2) | (0xB0..=0xBF, Version::V3) => Some(Self::Frame),
             (0xCE, Version::V2) | (0xA0, Version::V3) => Some(Self::Time),
             (0xCD, Version::V2) | (0xD0, Version::V3) => Some(Self::Mark),
@@ -66,7 +64,6 @@ impl Item {
     /// How long it is, from its first bytes; `None` if they are not all here.
     fn len(self, bytes: &[u8]) -> Option<usize> {
         Some(match self {
-            Self::Head => HEAD_BYTES,
             Self::Frame => FRAME_BYTES + usize::from(*bytes.get(FRAME_BYTES - 1)? & 0xF).min(8),
             Self::Time => TIME_BYTES,
             Self::Mark => 2 + usize::from(*bytes.get(1)?),
@@ -111,8 +108,7 @@ impl Decode for Decoder {
                     return Ok(Found::Issue(place, fault));
                 }
             };
-            let item = Item::of(first, version).filter(|item| *item != Item::Head);
-            let Some(item) = item else { return Ok(skip(input, place, version)) };
+            let Some(item) = Item::of(first, version) else { return Ok(skip(input, place, version)) };
             let Some(whole) = item.len(bytes).and_then(|len| bytes.get(..len)) else {
                 let len = bytes.len();
                 input.consume(len);
@@ -129,7 +125,7 @@ impl Decode for Decoder {
                 Item::Time => {
                     self.base_us = whole[1..].first_chunk().map(|us| u64::from_le_bytes(*us));
                 }
-                _ => {
+                Item::Frame => {
                     return Ok(match self.frame(&whole, version) {
                         Ok(record) => Found::Record(record),
                         Err(fault) => Found::Issue(place, fault),
@@ -166,7 +162,9 @@ impl Decoder {
 fn skip(input: &mut Input, place: Place, version: Version) -> Found {
     let bytes = input.buffered();
     let shown = bytes[..bytes.len().min(8)].to_vec();
-    let next = bytes.iter().skip(1).position(|byte| Item::of(*byte, version).is_some());
+    // A head begins with C.
+    let may_be = |byte: &u8| *byte == b'C' || Item::of(*byte, version).is_some();
+    let next = bytes.iter().skip(1).position(may_be);
     let skipped = next.map_or(bytes.len(), |next| next + 1);
     input.consume(skipped);
     Found::Issue(place, Fault::malformed("a frame, a time or a mark", &shown))

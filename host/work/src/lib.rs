@@ -13,7 +13,7 @@
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
 //! | [`read_ahead`], [`missing`], [`databases`], [`reading`] | traces, what is missing from them, and what they mean |
 //! | [`recording`] | a trace that grows, or waits for a condition |
-//! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`] | messages for people |
+//! | [`report`], [`advice`], [`announcement`], [`terms`], [`code_texts`], [`cut`] | messages for people |
 //! | [`atomic_file`], [`memory_image`], [`interrupt`], [`dfu`] | files, Ctrl-C, and the chip's bootloader |
 
 #![forbid(unsafe_code)]
@@ -43,6 +43,8 @@ pub mod channel_options;
 pub mod channels;
 #[cfg(feature = "buses")]
 pub mod code_texts;
+#[cfg(feature = "buses")]
+pub mod cut;
 #[cfg(feature = "buses")]
 pub mod databases;
 #[cfg(feature = "dfu")]

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_signals::{Alarm, Decoder, MessageRef, Selection, SelectionError, Signal, SignalValue};
+use cantap_work::cut::cut;
 
-use super::super::cut::cut;
 use super::series::{BLOCK_BYTES, Series};
 
 /// Limit for rows; more than fit on any screen.

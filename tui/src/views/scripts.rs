@@ -2,13 +2,14 @@
 
 use std::fmt::Write;
 
+use cantap_work::cut::cut;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::Line;
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
-use super::super::cut::{cut, draw_lines};
+use super::super::cut::draw_lines;
 use super::super::model::scripts::ScriptRow;
 use super::super::model::{LineKind, Model, ScriptState};
 use super::super::theme::Theme;

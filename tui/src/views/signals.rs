@@ -1,6 +1,7 @@
 //! Live values of decoded signals, with extremes, alarms and the recent past.
 
 use cantap_signals::{Alarm, Number};
+use cantap_work::cut::cut;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -8,7 +9,6 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::{App, SignalColumn};
-use super::super::cut::cut;
 use super::super::model::{Decoded, Model, Seen, SignalRow};
 use super::super::theme::Theme;
 use super::list::list;

@@ -8,6 +8,7 @@ use cantap::{DeviceError, TraceEvent, TraceRecord};
 use cantap_wire::message::TxFrame;
 
 use super::*;
+use crate::testing::{frames, until};
 
 #[derive(Default)]
 struct State {
@@ -121,24 +122,6 @@ impl Usb for StandIn {
 fn session(stand_in: &StandIn) -> Device {
     let driver = CanalystIi::over(Box::new(stand_in.clone()), "A1".to_owned(), "canalyst-ii:").unwrap();
     Device::over(crate::engine::start(Box::new(driver)).unwrap(), "canalyst-ii:").unwrap()
-}
-
-fn until(device: &Device, frame: &str) -> Vec<TraceRecord> {
-    let mut all = Vec::new();
-    for record in device.records() {
-        let record = record.unwrap();
-        let is_last = record.frame().is_some_and(|there| there.to_string() == frame);
-        all.push(record);
-        if is_last {
-            break;
-        }
-    }
-    all
-}
-
-fn frames(records: &[TraceRecord]) -> Vec<(u8, String)> {
-    let frame = |record: &TraceRecord| Some((record.channel, record.frame()?.to_string()));
-    records.iter().filter_map(frame).collect()
 }
 
 #[test]

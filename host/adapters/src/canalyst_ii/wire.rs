@@ -67,8 +67,11 @@ pub(super) fn set(bitrate_bps: u32) -> Option<Command> {
 /// Messages that wait to be read, and to be sent; `None` if this is no such answer.
 pub(super) fn waiting(answer: &[u8]) -> Option<(u32, u32)> {
     let (packet, []) = answer.split_first_chunk::<PACKET>()? else { return None };
-    let word = |at: usize| Some(u32::from_le_bytes(packet.get(at..at + 4)?.try_into().ok()?));
-    Some((word(4)?, word(8)?))
+    Some((word(packet, 4)?, word(packet, 8)?))
+}
+
+fn word(bytes: &[u8], at: usize) -> Option<u32> {
+    Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?))
 }
 
 /// One message, or what should be one.
@@ -95,8 +98,7 @@ fn message(bytes: &[u8]) -> Message {
 }
 
 fn read(bytes: &[u8]) -> Option<Message> {
-    let word = |at: usize| Some(u32::from_le_bytes(bytes.get(at..at + 4)?.try_into().ok()?));
-    let (raw, stamp) = (word(0)?, word(4)?);
+    let (raw, stamp) = (word(bytes, 0)?, word(bytes, 4)?);
     let &[has_stamp, _, is_remote, is_extended, len] = bytes.get(8..13)? else { return None };
     let id = if is_extended != 0 { Id::extended(raw) } else { Id::standard(raw) }?;
     let data = bytes.get(13..MESSAGE)?.try_into().ok().filter(|_| len <= 8)?;

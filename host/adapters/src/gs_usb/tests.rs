@@ -16,6 +16,7 @@ use cantap_wire::record::ErrorState;
 use super::wire::tests::constants;
 use super::*;
 use crate::source::Piece;
+use crate::testing::{frames, until};
 
 const EVERYTHING: u32 = feature::LISTEN_ONLY
     | feature::STAMPS
@@ -191,25 +192,6 @@ fn connect(stand_in: &StandIn, options: Options) -> Result<GsUsb, OpenError> {
 fn session(stand_in: &StandIn) -> Device {
     let driver = connect(stand_in, Options::default()).unwrap();
     Device::over(crate::engine::start(Box::new(driver)).unwrap(), "gs_usb:").unwrap()
-}
-
-/// Records until a frame, given as text.
-fn until(device: &Device, frame: &str) -> Vec<TraceRecord> {
-    let mut all = Vec::new();
-    for record in device.records() {
-        let record = record.unwrap();
-        let is_last = record.frame().is_some_and(|there| there.to_string() == frame);
-        all.push(record);
-        if is_last {
-            break;
-        }
-    }
-    all
-}
-
-fn frames(records: &[TraceRecord]) -> Vec<(u8, String)> {
-    let frame = |record: &TraceRecord| Some((record.channel, record.frame()?.to_string()));
-    records.iter().filter_map(frame).collect()
 }
 
 fn losses(records: &[TraceRecord]) -> Vec<(&'static str, u32)> {

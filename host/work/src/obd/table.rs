@@ -4,6 +4,8 @@ use std::fmt::Write as _;
 
 use cantap_protocols::{Event, Field, Value};
 
+use crate::cut::cut;
+
 /// Fields that say what was asked, and not what was answered.
 const OF_THE_QUESTION: [&str; 4] = ["sid", "pid", "did", "asked"];
 /// Decimals of a value; more are the conversion's and not the sensor's.
@@ -170,14 +172,6 @@ impl Table {
         }
         text
     }
-}
-
-/// A line of at most this many characters; what is cut ends in `…`.
-fn cut(line: &str, columns: usize) -> String {
-    if line.chars().count() <= columns {
-        return line.to_owned();
-    }
-    line.chars().take(columns.saturating_sub(1)).chain(['…']).collect()
 }
 
 fn number(value: &Value) -> Option<f64> {

@@ -1,8 +1,8 @@
 //! The graph's ticks: values on the left, times of day below.
 
 use cantap_analysis::plot::scale::{label, ticks, time_ticks};
+use cantap_work::cut::cut;
 
-use super::super::super::cut::cut;
 use super::super::super::times::clock;
 use super::curve::Time;
 

@@ -88,7 +88,6 @@ struct Reader<'a, 'i> {
 }
 
 /// Parameters one after another.
-#[derive(Default)]
 struct Row {
     params: Vec<Param>,
     /// Where the next one begins; `None` behind one whose length depends on the message.
@@ -187,7 +186,7 @@ impl<'a, 'i> Reader<'a, 'i> {
             let [request, response] = ["REQ", "POS"]
                 .map(|part| child(protocol, part))
                 .map(|part| part.map(|part| self.message(loader, &name, instance, template, part)));
-            let long_name: Vec<Name> = vec![translated(instance, "NAME"), translated(service, "NAME")];
+            let long_name = [translated(instance, "NAME"), translated(service, "NAME")];
             let number = loader.model.services.len() as u32;
             loader.model.services.push(DiagService {
                 name,

@@ -23,6 +23,9 @@ use serde::{Deserialize, Serialize};
 
 /// Longest block of a trace; far longer than a CAN packet.
 const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
+/// Longest block of a packet of CAN: such a packet, and a comment of the greatest length. What claims more is damaged, and from a pipe nothing
+/// so long may ever come.
+const MAX_CAN_BLOCK_BYTES: usize = (1 << 16) + 4096;
 /// Interfaces beyond this number are damage, not channels.
 const MAX_INTERFACES: usize = 4096;
 
@@ -162,7 +165,8 @@ impl Decode for Decoder {
             }
             let fields = Fields { bytes: &first, big_endian: self.big_endian };
             let (kind, len) = (fields.u32(0).unwrap_or(0), fields.u32(4).unwrap_or(0) as usize);
-            let sane = (BLOCK_FRAME_BYTES..=MAX_BLOCK_BYTES).contains(&len) && len.is_multiple_of(4);
+            let most = if self.is_packet_of_can(fields) { MAX_CAN_BLOCK_BYTES } else { MAX_BLOCK_BYTES };
+            let sane = (BLOCK_FRAME_BYTES..=most).contains(&len) && len.is_multiple_of(4);
             if sane {
                 let block = input.peek(len)?;
                 let have = block.len();
@@ -241,32 +245,51 @@ impl Decoder {
         (1..rest.len() / 4).all(|word| !self.is_block(&rest[4 * word..]))
     }
 
+    /// Whether a packet's block begins here, of an interface that carries CAN.
+    fn is_packet_of_can(&self, head: Fields) -> bool {
+        let interface = || self.interfaces.get(head.u32(8)? as usize)?.link;
+        head.u32(0) == Some(ENHANCED_PACKET) && interface().is_some()
+    }
+
     /// Whether a whole, known block begins here.
     fn is_block(&self, bytes: &[u8]) -> bool {
+        let fields = Fields { bytes, big_endian: self.big_endian };
+        self.length_of_known(bytes).is_some_and(|len| fields.u32(len - 4) == Some(len as u32))
+    }
+
+    /// How long the block is that begins here, if it is of a known kind and can be a packet's.
+    fn length_of_known(&self, bytes: &[u8]) -> Option<usize> {
         let fields = Fields { bytes, big_endian: self.big_endian };
         let known = matches!(
             fields.u32(0),
             Some(SECTION_HEADER | INTERFACE_DESCRIPTION | ENHANCED_PACKET | STATISTICS)
         );
-        let Some(len) = fields.u32(4).map(|len| len as usize).filter(|_| known) else { return false };
-        (BLOCK_FRAME_BYTES..=4096).contains(&len) && fields.u32(len - 4) == Some(len as u32)
+        let len = fields.u32(4)? as usize;
+        (known && (BLOCK_FRAME_BYTES..=4096).contains(&len)).then_some(len)
     }
 
-    /// Skips to the next whole block, or to the end.
+    /// Skips to the next whole block, or to the end. A block that is not there to its end is not waited for while a later one is whole:
+    /// four bytes of a frame can look like the head of a block, and what has come through a pipe may be all there is for a while.
     fn resync(&self, input: &mut Input) -> io::Result<()> {
         input.consume(4);
         loop {
-            // Enough to see a packet's whole block.
-            let bytes = input.peek(8192)?;
-            if bytes.len() < BLOCK_FRAME_BYTES {
-                let rest = bytes.len();
-                input.consume(rest);
+            let bytes = input.buffered();
+            let rests = || (0..bytes.len()).step_by(4).map(|at| (at, &bytes[at..]));
+            if let Some((at, _)) = rests().find(|(_, rest)| self.is_block(rest)) {
+                input.consume(at);
                 return Ok(());
             }
-            if self.is_block(bytes) {
+            let is_open = |rest: &[u8]| {
+                rest.len() < BLOCK_FRAME_BYTES
+                    || self.length_of_known(rest).is_some_and(|len| rest.len() < len)
+            };
+            let open = rests().find(|(_, rest)| is_open(rest)).map_or(bytes.len(), |(at, _)| at);
+            input.consume(open);
+            let have = input.buffered().len();
+            if input.peek(have + 1)?.len() == have {
+                input.consume(have);
                 return Ok(());
             }
-            input.consume(4);
         }
     }
 

@@ -210,7 +210,7 @@ impl Simulation {
             return next_ns != NEVER;
         }
         self.now_ns = next_ns.max(self.now_ns);
-        self.go_wrong();
+        self.inject_faults();
         for channel in Channel::ALL {
             self.pass(channel);
         }

@@ -24,9 +24,9 @@ pub struct Source {
     /// Frames of each channel that found no room in front of the client, as far as the board's totals have them.
     counted: [u64; CHANNELS],
     /// Frames of whose loss the client was told.
-    told: u64,
+    reported: u64,
     /// Frames of whose loss it is told by what is written next.
-    to_tell: u64,
+    being_reported: u64,
 }
 
 impl Source {
@@ -37,8 +37,8 @@ impl Source {
             device: Arc::clone(device),
             records: device.records(),
             counted: [0; CHANNELS],
-            told: 0,
-            to_tell: 0,
+            reported: 0,
+            being_reported: 0,
         }
     }
 
@@ -59,21 +59,21 @@ impl Source {
             _ => 0,
         });
         match losses {
-            Losses::ToldByWriting => self.to_tell += lost.sum::<u64>(),
-            Losses::LeftOut => self.told += lost.sum::<u64>(),
+            Losses::ToldByWriting => self.being_reported += lost.sum::<u64>(),
+            Losses::LeftOut => self.reported += lost.sum::<u64>(),
             Losses::NotTold => {}
         }
     }
 
     fn has_written(&mut self) {
-        self.told += std::mem::take(&mut self.to_tell);
+        self.reported += std::mem::take(&mut self.being_reported);
     }
 
     /// Frames lost in front of the client of which it was not told.
-    fn untold(&self) -> u64 {
+    fn unreported(&self) -> u64 {
         let counters = self.device.counters();
         let lost: u64 = counters.channels.iter().map(|channel| channel.lost_host).sum();
-        lost.saturating_sub(self.told)
+        lost.saturating_sub(self.reported)
     }
 }
 
@@ -125,7 +125,7 @@ pub fn run(sources: &mut [Source], feed: &mut impl Feed) -> u64 {
         sources.iter_mut().for_each(Source::has_written);
         pace.has_written(Instant::now());
     }
-    let untold = sources.iter().map(Source::untold).sum();
+    let unreported = sources.iter().map(Source::unreported).sum();
     sources.iter_mut().for_each(Source::count_losses);
-    untold
+    unreported
 }

@@ -61,7 +61,7 @@ pub struct Session<'a> {
     waiting: Vec<(u64, Receiver<Answer>)>,
     state_version: u64,
     notices: u64,
-    heard: Instant,
+    latest_activity: Instant,
     pinged: Instant,
 }
 
@@ -96,7 +96,7 @@ impl<'a> Session<'a> {
             waiting: Vec::new(),
             state_version: 0,
             notices: 0,
-            heard: now,
+            latest_activity: now,
             pinged: now,
         })
     }
@@ -128,15 +128,15 @@ impl<'a> Session<'a> {
             self.pass_records()?;
             match self.socket.read() {
                 Ok(Frame::Text(text)) => {
-                    self.is_heard();
+                    self.note_activity();
                     self.take(text.as_str())?;
                 }
                 Ok(Frame::Binary(_)) => return Ok(None),
-                Ok(_) => self.is_heard(),
+                Ok(_) => self.note_activity(),
                 Err(Error::Io(error)) if is_idle(&error) => {}
                 Err(error) => return Err(error),
             }
-            if self.heard.elapsed() >= GONE_AFTER {
+            if self.latest_activity.elapsed() >= GONE_AFTER {
                 return Ok(None);
             }
             if self.pinged.elapsed() >= PING_EVERY {
@@ -150,9 +150,9 @@ impl<'a> Session<'a> {
         Ok(None)
     }
 
-    fn is_heard(&mut self) {
-        self.heard = Instant::now();
-        self.shared.is_heard();
+    fn note_activity(&mut self) {
+        self.latest_activity = Instant::now();
+        self.shared.note_activity();
     }
 
     /// State, notices and answers.

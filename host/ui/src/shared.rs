@@ -136,7 +136,7 @@ impl Shared {
         let enter = |pages| (pages < most).then_some(pages + 1);
         let before = self.pages.fetch_update(Ordering::Relaxed, Ordering::Relaxed, enter).ok()?;
         self.change(|state| state.pages = before + 1);
-        self.is_heard();
+        self.note_activity();
         Some(Page(self))
     }
 
@@ -146,7 +146,7 @@ impl Shared {
     }
 
     /// A page has shown that it is there.
-    pub fn is_heard(&self) {
+    pub fn note_activity(&self) {
         self.latest_message_ms.store(self.started.elapsed().as_millis() as u64, Ordering::Relaxed);
     }
 

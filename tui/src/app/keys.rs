@@ -61,8 +61,8 @@ impl App {
             KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
             KeyCode::Char(digit @ '1'..='9') => self.show(View::ALL[digit as usize - '1' as usize]),
             KeyCode::Char('0') => self.open_vehicle(model),
-            KeyCode::Tab => self.show(self.view.beside(true)),
-            KeyCode::BackTab => self.show(self.view.beside(false)),
+            KeyCode::Tab => self.show(self.view.neighbour(true)),
+            KeyCode::BackTab => self.show(self.view.neighbour(false)),
             // On every page, as its last line says.
             KeyCode::Char(' ') if matches!(model.source, SourceState::Playing(_)) => {
                 self.toggle_playback(model);

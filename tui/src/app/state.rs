@@ -63,7 +63,7 @@ impl View {
     const BY_TAB: usize = Self::ALL.len() - 1;
 
     /// The page that follows this one by Tab, or precedes it.
-    pub(super) const fn beside(self, is_next: bool) -> Self {
+    pub(super) const fn neighbour(self, is_next: bool) -> Self {
         let step = if is_next { 1 } else { Self::BY_TAB - 1 };
         let place = match (self, is_next) {
             (Self::Obd, true) => Self::BY_TAB - 1,

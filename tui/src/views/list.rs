@@ -10,8 +10,8 @@ use super::super::cut::draw_lines;
 use super::super::theme::Theme;
 use super::bottom::wrapped;
 
-/// Most lines of what is said above a page's rows.
-const MOST_SAID: usize = 3;
+/// Most lines of a notice above a page's rows.
+const MOST_NOTICE_LINES: usize = 3;
 
 /// A number of bytes for display.
 pub fn bytes(bytes: u64) -> String {
@@ -24,9 +24,9 @@ pub fn bytes(bytes: u64) -> String {
 }
 
 /// Draws a text at the top of a page, in as many lines as it needs: the end may be the key that is looked for. Returns the rest of the page.
-pub fn said(frame: &mut Frame<'_>, area: Rect, text: &str, style: Style) -> Rect {
+pub fn notice(frame: &mut Frame<'_>, area: Rect, text: &str, style: Style) -> Rect {
     let mut lines = wrapped(text, area.width.into());
-    lines.truncate(MOST_SAID);
+    lines.truncate(MOST_NOTICE_LINES);
     let [top, rest] =
         Layout::vertical([Constraint::Length(lines.len() as u16), Constraint::Min(1)]).areas(area);
     draw_lines(frame, top, lines.into_iter().map(|line| Line::styled(line, style)).collect());

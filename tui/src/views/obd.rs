@@ -8,7 +8,7 @@ use super::super::app::App;
 use super::super::cut::draw_lines;
 use super::super::model::Model;
 use super::super::theme::Theme;
-use super::list::said;
+use super::list::notice;
 use cantap_work::obd::AskingState;
 
 /// Draws the page.
@@ -29,7 +29,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         }
         (Some(_), state) => (format!("{} Space stops.", state.sentence()), app.theme.loss()),
     };
-    let body = said(frame, area, &text, style);
+    let body = notice(frame, area, &text, style);
     if vehicle.table.is_empty() {
         return draw_lines(frame, body, vec![Line::from("No values so far.")]);
     }

@@ -14,7 +14,7 @@ use super::super::model::scripts::ScriptRow;
 use super::super::model::{LineKind, Model, ScriptState};
 use super::super::theme::Theme;
 use super::bottom::wrapped;
-use super::list::{list, said};
+use super::list::{list, notice};
 
 /// Columns of a script's name.
 const NAME: usize = 28;
@@ -32,7 +32,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             app.theme.label(),
         ),
     };
-    let area = said(frame, area, text, style);
+    let area = notice(frame, area, text, style);
     let rows = scripts.rows.len().max(1) as u16 + 1;
     let gateway = scripts.gateway.len() as u16;
     // The list and the gateway leave a third of the page to the output.

@@ -7,7 +7,7 @@ use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::Seen;
-use super::list::{list, said};
+use super::list::{list, notice};
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
@@ -21,7 +21,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             app.theme.label(),
         ),
     };
-    let body = said(frame, area, text, style);
+    let body = notice(frame, area, text, style);
     if app.send.is_empty() {
         let database = if seen.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
         let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");

@@ -23,7 +23,7 @@ impl Simulation {
     }
 
     /// What is planned to go wrong now does, and what is over is.
-    pub(super) fn go_wrong(&mut self) {
+    pub(super) fn inject_faults(&mut self) {
         let now_ns = self.now_ns;
         while let Some(planned) = self.faults.pop_front_if(|planned| planned.at_ns <= now_ns) {
             match self.node_of(&planned) {

@@ -1,5 +1,5 @@
 //! Asks who is there. Each question has a number and a port of its own, and answers come to that port: whoever is not on the link, and has not
-//! heard the question, would have to guess both.
+//! answers the question, would have to guess both.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
@@ -63,14 +63,14 @@ pub(super) fn browse_on(network: Network, time: Duration) -> io::Result<Browsed>
         .filter_map(|link| link.asking(network).ok())
         .collect();
     let deadline = Instant::now() + time;
-    let mut heard = Heard::default();
+    let mut answers = Answers::default();
     let mut ask_at = Instant::now();
     let id = random(1..1 << 16) as u16;
     let mut bytes = vec![0; MOST_BYTES + 1];
-    while Instant::now() < deadline && !heard.is_cut {
+    while Instant::now() < deadline && !answers.is_cut {
         if Instant::now() >= ask_at {
             ask_at += ASK_EVERY;
-            let question = Message { id, ..heard.question() };
+            let question = Message { id, ..answers.question() };
             for speaker in &speakers {
                 speaker.tell_all(&question);
             }
@@ -84,26 +84,26 @@ pub(super) fn browse_on(network: Network, time: Duration) -> io::Result<Browsed>
                 && message.is_answer
                 && message.id == id
             {
-                heard.take(message);
+                answers.take(message);
             }
         }
         if is_quiet {
             std::thread::sleep(LOOK_EVERY);
         }
     }
-    Ok(heard.browsed(network.with_loopback))
+    Ok(answers.browsed(network.with_loopback))
 }
 
-/// What was said.
+/// What came back.
 #[derive(Default)]
-struct Heard {
+struct Answers {
     /// Servers, and where they are: a port of a host.
     servers: BTreeMap<Name, Option<(u16, Name)>>,
     hosts: BTreeMap<Name, BTreeSet<IpAddr>>,
     is_cut: bool,
 }
 
-impl Heard {
+impl Answers {
     /// Asks for servers, and for what is not known yet of those that there are.
     fn question(&self) -> Message {
         let mut message = Message::question(kind_name(), kind::PTR);

@@ -137,14 +137,14 @@ impl Page<'_> {
     fn values(&self, chosen: Chosen<'_>, text: impl Fn(f64) -> String) -> String {
         let at: Vec<_> = self.cursors().map(|(name, time_ns)| (name, chosen.series.at(time_ns))).collect();
         // There may have been no value yet at a cursor.
-        let said = |value: Option<f64>| value.map_or("–".to_owned(), &text);
+        let shown = |value: Option<f64>| value.map_or("–".to_owned(), &text);
         match at[..] {
             [] => text(chosen.row.value),
-            [(name, value)] => format!("{name} {}", said(value)),
+            [(name, value)] => format!("{name} {}", shown(value)),
             [(_, first), (_, second), ..] => {
                 let difference = first.zip(second).map(|(first, second)| second - first);
                 let difference = difference.map_or("–".to_owned(), short);
-                format!("A {} B {} Δ {difference}", said(first), said(second))
+                format!("A {} B {} Δ {difference}", shown(first), shown(second))
             }
         }
     }

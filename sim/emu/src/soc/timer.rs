@@ -39,6 +39,8 @@ pub struct Timer {
     flags: u32,
     modes: [u32; 3],
     count: u32,
+    /// Ticks up to the last overflow, from when the count was last set.
+    overflown: u64,
     /// When `count` was last a whole number of ticks.
     since: u64,
     prescaler: u32,
@@ -69,6 +71,7 @@ impl Timer {
             flags: 0,
             modes: [0; 3],
             count: 0,
+            overflown: 0,
             since: 0,
             prescaler: 0,
             next_prescaler: 0,
@@ -141,7 +144,7 @@ impl Timer {
             0x10 => self.flags &= value,
             0x14 => {
                 if value & 1 != 0 {
-                    self.count = 0;
+                    (self.count, self.overflown) = (0, 0);
                     self.since = now;
                     if self.control & UDIS == 0 {
                         self.take_preloads();
@@ -158,7 +161,7 @@ impl Timer {
                     mode => self.reference_2 = mode == FORCED_ACTIVE,
                 }
             }
-            0x24 => (self.count, self.since) = (value & self.max, now),
+            0x24 => (self.count, self.overflown, self.since) = (value & self.max, 0, now),
             0x28 => self.next_prescaler = value & 0xFFFF,
             0x2C => {
                 self.next_reload = value & self.max;
@@ -282,10 +285,11 @@ impl Timer {
         self.modes[channel / 2] >> (8 * (channel % 2)) & 3
     }
 
-    /// The core cycle at which the count would have been zero, had it always run at its present rate.
+    /// The core cycle at which the count would have been zero, had it always run at its present rate; however often it has overflown since
+    /// then.
     pub fn origin(&mut self, now: u64) -> u64 {
         self.advance(now);
-        self.since.saturating_sub(u64::from(self.count) * self.tick())
+        self.since.saturating_sub((self.overflown + u64::from(self.count)) * self.tick())
     }
 
     /// Whether an enabled flag is set.
@@ -338,6 +342,7 @@ impl Timer {
                 self.count += step as u32;
                 return;
             }
+            self.overflown += u64::from(self.count) + to_update;
             self.count = 0;
             if self.control & UDIS == 0 {
                 self.take_preloads();
@@ -415,6 +420,17 @@ mod tests {
         assert_eq!(timer.read(0x24, 12).unwrap(), 0);
         assert!(timer.irq());
         assert_eq!(timer.read(0x10, 12).unwrap() & UIF, UIF);
+    }
+
+    #[test]
+    fn its_zero_stays_where_it_was_when_it_wraps() {
+        let mut timer = stamp_timer();
+        timer.write(0x24, 10, 1000).unwrap();
+        assert_eq!(timer.origin(5000), 880);
+        assert_eq!(timer.origin(880 + 12 * (1 << 32)), 880);
+        assert_eq!(timer.origin(900 + 36 * (1 << 32)), 880);
+        timer.write(0x24, 0, 99_000).unwrap();
+        assert_eq!(timer.origin(99_000), 99_000);
     }
 
     #[test]

@@ -7,7 +7,9 @@ use cantap_signals::Decoder;
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
+use crate::calibration::Known;
 use crate::canopen::{CanOpen, Sheet};
+use crate::ccp::Ccp;
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, KnownPairs};
@@ -16,6 +18,7 @@ use crate::odx::Descriptions;
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
 use crate::watch::Begun;
+use crate::xcp::Xcp;
 use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
 /// What to decode.
@@ -31,12 +34,14 @@ pub struct Options {
     pub sheets: Vec<Sheet>,
     /// Descriptions of ECUs for diagnostics.
     pub descriptions: Option<Arc<Descriptions>>,
+    /// Connections of XCP and CCP, and what is at which address.
+    pub calibration: Known,
 }
 
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     /// Those that a channel needs, or has needed.
-    readers: [Option<Box<dyn Assembler + Send + Sync>>; 3],
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
     /// J1939 and NMEA 2000: a channel may have one of them, and the other later.
     family: Option<Box<J1939>>,
     /// The protocols of each channel.
@@ -63,6 +68,8 @@ const OF_DIAGNOSTICS: u8 = 1;
 const OF_CANOPEN: u8 = 2;
 const OF_DEVICENET: u8 = 4;
 const OF_FAMILY: u8 = 8;
+const OF_XCP: u8 = 16;
+const OF_CCP: u8 = 32;
 
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
@@ -71,6 +78,8 @@ fn readers_of(spoken: u16) -> u8 {
         | has(FAMILY, OF_FAMILY)
         | has(Protocol::CanOpen.bit(), OF_CANOPEN)
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
+        | has(Protocol::Xcp.bit(), OF_XCP)
+        | has(Protocol::Ccp.bit(), OF_CCP)
 }
 
 /// Whose groups a channel with these protocols has.
@@ -92,7 +101,7 @@ impl Conversations {
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
         // Without a survey or a choice, frames that fit two protocols would be decoded twice.
         let everywhere = match (spoken, options.protocols.is_empty()) {
-            (Some(_), _) | (None, true) => Protocol::DIAGNOSTICS & wanted,
+            (Some(_), _) | (None, true) => (Protocol::DIAGNOSTICS | options.calibration.protocols()) & wanted,
             (None, false) => wanted,
         };
         let (mut of_channels, mut doubts) = ([everywhere; 256], FxHashMap::default());
@@ -157,7 +166,7 @@ impl Conversations {
             }
         }
         for (number, reader) in self.readers.iter_mut().enumerate() {
-            if needed & 1 << number == 0 || reader.is_some() {
+            if needed & 1 << number & !OF_FAMILY == 0 || reader.is_some() {
                 continue;
             }
             *reader = Some(match 1 << number {
@@ -169,6 +178,8 @@ impl Conversations {
                     Box::new(diagnostics.with_descriptions(options.descriptions.clone()))
                 }
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
+                OF_XCP => Box::new(Xcp::new(options.calibration.clone())),
+                OF_CCP => Box::new(Ccp::new(options.calibration.clone())),
                 _ => Box::new(DeviceNet::new()),
             });
         }

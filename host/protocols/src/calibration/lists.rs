@@ -93,6 +93,11 @@ impl Lists {
         self.lists.iter_mut()
     }
 
+    /// Whether the pointer is somewhere.
+    pub const fn is_pointing(&self) -> bool {
+        self.pointer.is_some()
+    }
+
     /// A list by its number.
     pub fn get(&self, number: u16) -> Option<&List> {
         self.lists.get(&number)

@@ -31,7 +31,6 @@ pub struct Slave {
     description: Option<Arc<Description>>,
     /// By CONNECT's response.
     order: Option<ByteOrder>,
-    max_cto: Option<usize>,
     /// Bytes of an address unit.
     granularity: usize,
     /// Commands may be sent before the last one is answered.
@@ -67,7 +66,6 @@ impl Connection for Slave {
             parties,
             description,
             order: None,
-            max_cto: None,
             granularity: 1,
             is_interleaved: false,
             mta: None,
@@ -377,10 +375,9 @@ impl Slave {
         let byte = |at: usize| command.get(at).copied();
         match command[0] {
             command::CONNECT => {
-                if let &[_, _, mode, max_cto, ..] = response {
+                if let &[_, _, mode, ..] = response {
                     self.order = Some(if mode & 1 == 0 { ByteOrder::Little } else { ByteOrder::Big });
                     self.granularity = 1 << (mode >> 1 & 3).min(2);
-                    self.max_cto = Some(usize::from(max_cto).max(8));
                     self.mta = None;
                 }
             }

@@ -106,7 +106,11 @@ fn blocks_are_one_event() {
     .collect();
     records.insert(4, lost(4.0));
     let all: Vec<_> = events(Xcp::new(Known::default()), &records).iter().map(ToString::to_string).collect();
-    assert!(all[1].ends_with("received 01 02 03 04 05 06 07, after 1 ms; frames were lost meanwhile"), "{}", all[1]);
+    assert!(
+        all[1].ends_with("received 01 02 03 04 05 06 07, after 1 ms; frames were lost meanwhile"),
+        "{}",
+        all[1]
+    );
     assert!(all[2].contains("RES: value 08 09 0A, request \"not heard\""), "{}", all[2]);
 }
 

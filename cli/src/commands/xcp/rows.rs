@@ -3,6 +3,7 @@
 use std::io::Write as _;
 
 use cantap_protocols::{Field, Value};
+use cantap_trace::clean;
 use serde_json::{Map, json};
 
 use super::targets::Target;
@@ -65,7 +66,7 @@ fn cell(field: &Field) -> String {
     let text = match (&field.text, &field.value) {
         (Some(text), _) => text.to_string(),
         (None, Value::Missing) => String::new(),
-        (None, Value::Text(text)) => text.to_string(),
+        (None, Value::Text(text)) => clean::line(text).into_owned(),
         (None, Value::Hex(number, _)) => number.to_string(),
         (None, value) => value.to_string(),
     };

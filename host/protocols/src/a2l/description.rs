@@ -107,7 +107,7 @@ impl Description {
                 let object = &self.objects[place];
                 let size = if object.is_text { object.size() } else { object.data_type.size() };
                 let from = (at - address) as usize;
-                if let Some(bytes) = bytes.get(from..from + size) {
+                if let Some(bytes) = bytes.get(from..from.saturating_add(size)) {
                     fields.push(object.field(element, bytes, order));
                 }
             }

@@ -2,7 +2,7 @@
 //! looked for, so that it does not matter by which A2ML it was written.
 
 use a2lfile::GenericIfData;
-use cantap_trace::Id;
+use cantap_trace::{Id, clean};
 
 use crate::calibration::connection::MasterSlave;
 use crate::calibration::parts::ByteOrder;
@@ -156,7 +156,9 @@ impl Transport {
                 }
                 _ => None,
             };
-            let (Ok(number), name) = (u16::try_from(*number), (*name).to_owned()) else { continue };
+            let (Ok(number), name) = (u16::try_from(*number), clean::line(name).into_owned()) else {
+                continue;
+            };
             if self.events.iter().all(|known| known.number != number) {
                 self.events.push(DaqEvent { number, name, period_s });
             }

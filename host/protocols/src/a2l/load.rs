@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use a2lfile::{A2lFile, A2lObjectName as _, ByteOrderEnum, CharacteristicType, ConversionType, Module};
+use cantap_trace::clean;
 use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::conversion::{Conversion, Texts};
@@ -81,6 +82,11 @@ impl Description {
         }
         of_file(&file, issues)
     }
+}
+
+/// A text of the file, as it can be shown.
+fn shown(text: &str) -> String {
+    clean::line(text).into_owned()
 }
 
 /// The text of a file, in whichever of the usual encodings.
@@ -186,7 +192,7 @@ impl Loader<'_> {
         for data in self.module.if_data.iter().filter_map(|data| data.ifdata_items.as_ref()) {
             transport.take(data);
         }
-        let mut description = Description::new(self.module.get_name().to_owned(), transport);
+        let mut description = Description::new(shown(self.module.get_name()), transport);
         for measurement in self.module.measurement.iter() {
             if let Some(object) = self.measurement(measurement) {
                 description.add(object);
@@ -207,7 +213,7 @@ impl Loader<'_> {
 
     fn issue(&mut self, issue: String) {
         if self.issues.len() < MOST_ISSUES {
-            self.issues.push(issue);
+            self.issues.push(shown(&issue));
         } else if self.issues.len() == MOST_ISSUES {
             self.issues.push("there is more that is left out".to_owned());
         }
@@ -244,8 +250,8 @@ impl Loader<'_> {
         let (conversion, status, unit) = self.conversion(name, &from.conversion);
         let array = from.array_size.as_ref().map(|size| u32::from(size.number));
         Some(Object {
-            name: name.to_owned(),
-            description: from.long_identifier.clone(),
+            name: shown(name),
+            description: shown(&from.long_identifier),
             extension: from.ecu_address_extension.as_ref().map_or(0, |extension| extension.extension as u8),
             address,
             data_type,
@@ -253,7 +259,7 @@ impl Loader<'_> {
             bits,
             conversion,
             status,
-            unit: from.phys_unit.as_ref().map_or(unit, |unit| unit.unit.clone()),
+            unit: from.phys_unit.as_ref().map_or(unit, |unit| shown(&unit.unit)),
             count: product(from.matrix_dim.as_ref()).or(array).unwrap_or(1).max(1),
             is_text: false,
             is_parameter: false,
@@ -293,8 +299,8 @@ impl Loader<'_> {
         let number = from.number.as_ref().map(|number| u32::from(number.number));
         let count = if is_single { None } else { product(from.matrix_dim.as_ref()).or(number) };
         Some(Object {
-            name: name.to_owned(),
-            description: from.long_identifier.clone(),
+            name: shown(name),
+            description: shown(&from.long_identifier),
             extension: from.ecu_address_extension.as_ref().map_or(0, |extension| extension.extension as u8),
             address: from.address,
             data_type,
@@ -302,7 +308,7 @@ impl Loader<'_> {
             bits: bits_of(from.bit_mask.as_ref().map(|mask| mask.mask), None),
             conversion,
             status,
-            unit: from.phys_unit.as_ref().map_or(unit, |unit| unit.unit.clone()),
+            unit: from.phys_unit.as_ref().map_or(unit, |unit| shown(&unit.unit)),
             count: count.unwrap_or(1).max(1),
             is_text,
             is_parameter: from.read_only.is_none(),
@@ -343,7 +349,7 @@ impl Loader<'_> {
             };
             self.issue(format!("{object}: the {kind} of {name} is not evaluated"));
         }
-        let unit = if method.unit == "-" { String::new() } else { method.unit.clone() };
+        let unit = if method.unit == "-" { String::new() } else { shown(&method.unit) };
         // A default for all other numbers would hide every value.
         let status = status.map_or_else(Texts::default, |status| Texts { default: None, ..status });
         (conversion.unwrap_or(Conversion::Unknown), status, unit)
@@ -360,14 +366,14 @@ impl Loader<'_> {
     fn texts(&self, table: &str) -> Option<Texts> {
         if let Some(table) = self.module.compu_vtab.get(table) {
             let pairs = table.value_pairs.iter();
-            let ranges = pairs.map(|pair| (pair.in_val, pair.in_val, pair.out_val.clone())).collect();
-            let default = table.default_value.as_ref().map(|default| default.display_string.clone());
+            let ranges = pairs.map(|pair| (pair.in_val, pair.in_val, shown(&pair.out_val))).collect();
+            let default = table.default_value.as_ref().map(|default| shown(&default.display_string));
             return Some(Texts { ranges, default });
         }
         let table = self.module.compu_vtab_range.get(table)?;
         let triples = table.value_triples.iter();
-        let ranges = triples.map(|one| (one.in_val_min, one.in_val_max, one.out_val.clone())).collect();
-        let default = table.default_value.as_ref().map(|default| default.display_string.clone());
+        let ranges = triples.map(|one| (one.in_val_min, one.in_val_max, shown(&one.out_val))).collect();
+        let default = table.default_value.as_ref().map(|default| shown(&default.display_string));
         Some(Texts { ranges, default })
     }
 }

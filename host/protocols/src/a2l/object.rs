@@ -95,7 +95,8 @@ pub enum ValueError {
 impl Object {
     /// Bytes of all of it.
     pub const fn size(&self) -> usize {
-        if self.is_text { self.count as usize } else { self.data_type.size() * self.count as usize }
+        let count = self.count as usize;
+        if self.is_text { count } else { self.data_type.size().saturating_mul(count) }
     }
 
     /// The number in these bytes.

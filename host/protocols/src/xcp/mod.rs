@@ -9,6 +9,7 @@ pub mod codec;
 pub(crate) mod daq;
 pub(crate) mod signs;
 mod slave;
+mod state;
 #[cfg(test)]
 mod tests;
 

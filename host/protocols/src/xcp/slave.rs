@@ -7,13 +7,12 @@ use std::sync::Arc;
 use cantap_trace::{Id, TraceRecord};
 
 use super::codec::{self, Command, EV_CMD_PENDING, EV_SESSION_TERMINATED, LEAST_COMMAND, command};
-use super::daq::PacketLayout;
 use super::signs::ConnectFinder;
+use super::state::State;
 use crate::a2l::Description;
 use crate::calibration::Connection;
 use crate::calibration::connection::{MasterSlave, Waiting, no_response, slave_event, unasked};
 use crate::calibration::known::Known;
-use crate::calibration::lists::{Entry, Lists};
 use crate::calibration::parts::{ByteOrder, push_parts};
 use crate::{Event, EventKind, Field, Protocol, Trouble};
 
@@ -29,19 +28,8 @@ const MOST_WAITING: usize = 16;
 pub struct Slave {
     parties: MasterSlave,
     description: Option<Arc<Description>>,
-    /// By CONNECT's response.
-    order: Option<ByteOrder>,
-    /// Bytes of an address unit.
-    granularity: usize,
-    /// Commands may be sent before the last one is answered.
-    is_interleaved: bool,
-    /// The memory transfer address.
-    mta: Option<(u8, u32)>,
-    lists: Lists,
-    layout: PacketLayout,
+    state: State,
     waiting: VecDeque<Waiting>,
-    /// An identifier of its own that data packets of this slave were given.
-    daq_id: Option<Id>,
 }
 
 /// How many bytes a command's elements have in the response, if it returns memory.
@@ -62,18 +50,7 @@ impl Connection for Slave {
     type Finder = ConnectFinder;
 
     fn new(parties: MasterSlave, description: Option<Arc<Description>>) -> Self {
-        Self {
-            parties,
-            description,
-            order: None,
-            granularity: 1,
-            is_interleaved: false,
-            mta: None,
-            lists: Lists::default(),
-            layout: PacketLayout::default(),
-            waiting: VecDeque::new(),
-            daq_id: None,
-        }
+        Self { parties, description, state: State::default(), waiting: VecDeque::new() }
     }
 
     fn known(known: &Known) -> Vec<MasterSlave> {
@@ -93,15 +70,15 @@ impl Connection for Slave {
         }
         if let Some(waiting) = self.waiting.back_mut()
             && continues(waiting.command[0]) == Some(code)
-            && waiting.gathered.len() < self.granularity * usize::from(waiting.command[1])
+            && waiting.gathered.len() < self.state.granularity * usize::from(waiting.command[1])
         {
-            let at = self.granularity.max(2);
+            let at = self.state.granularity.max(2);
             waiting.gathered.extend_from_slice(data.get(at..).unwrap_or_default());
             waiting.frames += 1;
             (waiting.asked_ns, waiting.time_ns) = (record.time_ns, record.time_ns);
             return;
         }
-        if !self.is_interleaved || self.waiting.len() >= MOST_WAITING {
+        if !self.state.is_interleaved || self.waiting.len() >= MOST_WAITING {
             while let Some(before) = self.waiting.pop_front() {
                 events.push(self.unanswered(before, record.channel, Trouble::Overlapped));
             }
@@ -111,7 +88,7 @@ impl Connection for Slave {
             if data.len() < 2 {
                 waiting.command.resize(2, 0);
             }
-            waiting.gathered.extend_from_slice(data.get(self.granularity.max(2)..).unwrap_or_default());
+            waiting.gathered.extend_from_slice(data.get(self.state.granularity.max(2)..).unwrap_or_default());
         }
         self.waiting.push_back(waiting);
     }
@@ -162,7 +139,7 @@ impl Connection for Slave {
     }
 
     fn take_daq_id(&mut self) -> Option<Id> {
-        self.daq_id.take()
+        self.state.daq_id.take()
     }
 
     fn sweep(&mut self, now_ns: i64, channel: u8, events: &mut Vec<Event>) {
@@ -182,8 +159,8 @@ impl Connection for Slave {
     }
 
     fn gap(&mut self, is_short: bool, channel: u8, events: &mut Vec<Event>) {
-        self.lists.gap(is_short);
-        self.mta = None;
+        self.state.lists.gap(is_short);
+        self.state.mta = None;
         // What is gathered from several frames may lack one in the middle.
         for mut waiting in std::mem::take(&mut self.waiting) {
             waiting.frames_lost = true;
@@ -214,8 +191,8 @@ impl Slave {
             waiting.frames += 1;
         }
         if code == EV_SESSION_TERMINATED {
-            self.lists.clear();
-            self.mta = None;
+            self.state.lists.clear();
+            self.state.mta = None;
         }
         let title = codec::event_name(code).unwrap_or("EV");
         let mut event = slave_event(Protocol::Xcp, record, self.parties, EventKind::Notification, title);
@@ -245,8 +222,8 @@ impl Slave {
         };
         if returns_memory(waiting.command[0]) {
             let count = waiting.command.get(1).copied().unwrap_or_default();
-            let expected = usize::from(count) * self.granularity;
-            let part = data.get(self.granularity..).unwrap_or_default();
+            let expected = usize::from(count) * self.state.granularity;
+            let part = data.get(self.state.granularity..).unwrap_or_default();
             let room = expected.saturating_sub(waiting.gathered.len());
             waiting.gathered.extend_from_slice(&part[..part.len().min(room)]);
             // A block: the rest comes in further responses.
@@ -257,11 +234,11 @@ impl Slave {
         }
         let mut event = self.event(&waiting, record.channel, EventKind::Exchange);
         self.push_result(&waiting, data, &mut event);
-        self.apply(&waiting.command, data);
+        self.state.apply(&waiting.command, data);
         if waiting.command[0] == command::CONNECT {
             // Only now is the order of its bytes known.
             let parts = codec::find(command::CONNECT).map_or(&[][..], |command| command.response);
-            push_parts(&mut event.fields, parts, &data[1..], self.order);
+            push_parts(&mut event.fields, parts, &data[1..], self.state.order);
         }
         event.data =
             crate::Bytes::from_slice(if waiting.gathered.is_empty() { data } else { &waiting.gathered });
@@ -278,19 +255,19 @@ impl Slave {
         event.fields.push(Field::hex("command", code, 2));
         let data = &waiting.command[1..];
         match known {
-            Some(Command { request, .. }) => push_parts(&mut event.fields, request, data, self.order),
+            Some(Command { request, .. }) => push_parts(&mut event.fields, request, data, self.state.order),
             None if data.is_empty() => {}
             None => event.fields.push(Field::bytes("parameters", data)),
         }
         match code {
             command::WRITE_DAQ_MULTIPLE => {
-                for entry in self.entries_of(&waiting.command) {
+                for entry in self.state.entries_of(&waiting.command) {
                     event.fields.push(Field::number("size", entry.size as u32));
                     event.fields.push(Field::hex("address", entry.address, 8));
                 }
             }
             command::UPLOAD | command::DOWNLOAD | command::DOWNLOAD_MAX => {
-                if let Some((extension, address)) = self.mta {
+                if let Some((extension, address)) = self.state.mta {
                     event.fields.push(Field::number("extension", extension));
                     event.fields.push(Field::hex("address", address, 8));
                 }
@@ -305,23 +282,25 @@ impl Slave {
         let code = waiting.command[0];
         let (at, written): (_, &[u8]) = match code {
             command::CONNECT => return,
-            command::UPLOAD => (self.mta, &waiting.gathered),
-            command::SHORT_UPLOAD => (self.address_in(&waiting.command, 3), &waiting.gathered),
+            command::UPLOAD => (self.state.mta, &waiting.gathered),
+            command::SHORT_UPLOAD => (self.state.address_in(&waiting.command, 3), &waiting.gathered),
             command::DOWNLOAD => {
                 let count = waiting.command.get(1).copied().unwrap_or_default();
-                let length = usize::from(count) * self.granularity;
-                (self.mta, &waiting.gathered[..waiting.gathered.len().min(length)])
+                let length = usize::from(count) * self.state.granularity;
+                (self.state.mta, &waiting.gathered[..waiting.gathered.len().min(length)])
             }
-            command::DOWNLOAD_MAX => (self.mta, waiting.command.get(self.granularity..).unwrap_or_default()),
+            command::DOWNLOAD_MAX => {
+                (self.state.mta, waiting.command.get(self.state.granularity..).unwrap_or_default())
+            }
             command::SHORT_DOWNLOAD => {
                 let count = waiting.command.get(1).copied().unwrap_or_default();
                 let value = waiting.command.get(8..).unwrap_or_default();
-                let length = usize::from(count) * self.granularity;
-                (self.address_in(&waiting.command, 3), &value[..value.len().min(length)])
+                let length = usize::from(count) * self.state.granularity;
+                (self.state.address_in(&waiting.command, 3), &value[..value.len().min(length)])
             }
             _ => {
                 let response = codec::find(code).map_or(&[][..], |command| command.response);
-                push_parts(&mut event.fields, response, &data[1..], self.order);
+                push_parts(&mut event.fields, response, &data[1..], self.state.order);
                 return;
             }
         };
@@ -333,168 +312,17 @@ impl Slave {
         fields.push(Field::bytes("value", bytes));
         if let (Some(description), Some((extension, address))) = (&self.description, at) {
             // The addresses of a description count bytes where one unit is a byte.
-            if self.granularity == 1 {
-                fields.extend(description.fields(extension, address, bytes, self.order));
+            if self.state.granularity == 1 {
+                fields.extend(description.fields(extension, address, bytes, self.state.order));
             }
-        }
-    }
-
-    /// Extension and address in a command, from this place on.
-    fn address_in(&self, command: &[u8], at: usize) -> Option<(u8, u32)> {
-        let (&extension, address) = command.get(at..at + 5)?.split_first()?;
-        Some((extension, self.order?.number(address) as u32))
-    }
-
-    fn number_in(&self, command: &[u8], at: usize) -> Option<u16> {
-        Some(self.order?.number(command.get(at..at + 2)?) as u16)
-    }
-
-    fn entry_of(&self, bit: u8, size: u8, extension: u8, address: &[u8]) -> Option<Entry> {
-        Some(Entry {
-            extension,
-            address: self.order?.number(address) as u32,
-            size: usize::from(size) * self.granularity,
-            bit: (bit < 0x20).then_some(bit),
-        })
-    }
-
-    /// The entries of WRITE_DAQ_MULTIPLE.
-    fn entries_of<'a>(&'a self, command: &'a [u8]) -> impl Iterator<Item = Entry> + 'a {
-        let count = usize::from(command.get(1).copied().unwrap_or_default());
-        let all = command.get(2..).unwrap_or_default().chunks(8).take(count);
-        all.filter_map(|bytes| match *bytes {
-            [bit, size, a, b, c, d, extension, ..] => self.entry_of(bit, size, extension, &[a, b, c, d]),
-            [bit, size, a, b, c, d] => self.entry_of(bit, size, 0, &[a, b, c, d]),
-            _ => None,
-        })
-    }
-
-    /// What a command has changed, now that the slave has agreed.
-    fn apply(&mut self, command: &[u8], response: &[u8]) {
-        let number = |at| self.number_in(command, at);
-        let byte = |at: usize| command.get(at).copied();
-        match command[0] {
-            command::CONNECT => {
-                if let &[_, _, mode, ..] = response {
-                    self.order = Some(if mode & 1 == 0 { ByteOrder::Little } else { ByteOrder::Big });
-                    self.granularity = 1 << (mode >> 1 & 3).min(2);
-                    self.mta = None;
-                }
-            }
-            command::DISCONNECT => {
-                self.lists.clear();
-                self.mta = None;
-            }
-            command::GET_COMM_MODE_INFO => {
-                self.is_interleaved = response.get(2).is_some_and(|mode| mode & 2 != 0);
-            }
-            command::SET_MTA => self.mta = self.address_in(command, 3),
-            command::SHORT_UPLOAD | command::SHORT_DOWNLOAD => {
-                self.mta = self.address_in(command, 3);
-                self.advance(byte(1));
-            }
-            command::UPLOAD | command::DOWNLOAD | command::PROGRAM => self.advance(byte(1)),
-            // The slave sets it in ways that are not seen here.
-            command::GET_ID | command::DOWNLOAD_MAX | command::PROGRAM_MAX | command::BUILD_CHECKSUM => {
-                self.mta = None;
-            }
-            command::FREE_DAQ => self.lists.clear(),
-            command::CLEAR_DAQ_LIST => {
-                if let Some(daq) = number(2) {
-                    self.lists.clear_list(daq);
-                }
-            }
-            command::ALLOC_ODT => {
-                if let (Some(daq), Some(count)) = (number(2), byte(4)) {
-                    self.lists.allocate_packets(daq, count);
-                }
-            }
-            command::ALLOC_ODT_ENTRY => {
-                if let (Some(daq), Some(odt), Some(count)) = (number(2), byte(4), byte(5)) {
-                    self.lists.allocate_entries(daq, odt, count);
-                }
-            }
-            command::SET_DAQ_PTR => {
-                if let (Some(daq), Some(odt), Some(entry)) = (number(2), byte(4), byte(5)) {
-                    self.lists.point_to(daq, odt, entry);
-                }
-            }
-            command::WRITE_DAQ => {
-                if let &[_, bit, size, extension, a, b, c, d, ..] = command
-                    && let Some(entry) = self.entry_of(bit, size, extension, &[a, b, c, d])
-                {
-                    self.lists.write(entry);
-                }
-            }
-            command::WRITE_DAQ_MULTIPLE => {
-                let entries: Vec<_> = self.entries_of(command).collect();
-                entries.into_iter().for_each(|entry| self.lists.write(entry));
-            }
-            command::SET_DAQ_LIST_MODE => {
-                let event = number(4);
-                if let Some(list) = number(2).and_then(|daq| self.lists.list(daq)) {
-                    (list.mode, list.event) = (byte(1), event);
-                }
-            }
-            command::START_STOP_DAQ_LIST => {
-                if let Some(list) = number(2).and_then(|daq| self.lists.list(daq)) {
-                    list.first_pid = response.get(1).copied();
-                    match byte(1) {
-                        Some(0) => list.is_running = false,
-                        Some(1) => list.is_running = true,
-                        _ => list.is_selected = true,
-                    }
-                }
-            }
-            command::START_STOP_SYNCH => {
-                for (_, list) in self.lists.all() {
-                    match byte(1) {
-                        Some(0) => list.is_running = false,
-                        Some(1) => list.is_running |= list.is_selected,
-                        Some(2) => list.is_running &= !list.is_selected,
-                        _ => continue,
-                    }
-                    list.is_selected = false;
-                }
-            }
-            command::GET_DAQ_PROCESSOR_INFO => self.layout.take_processor_info(&response[1..]),
-            command::GET_DAQ_RESOLUTION_INFO => {
-                if let Some(order) = self.order {
-                    self.layout.take_resolution_info(&response[1..], order);
-                }
-            }
-            // GET_DAQ_ID and SET_DAQ_ID of the transport layer on CAN: an identifier for a list of its own.
-            0xF2 => {
-                let id = match byte(1) {
-                    Some(0xFE) => response.get(4..8),
-                    Some(0xFD) => command.get(4..8),
-                    _ => None,
-                };
-                if let (Some(bytes), Some(order)) = (id, self.order) {
-                    let raw = order.number(bytes) as u32;
-                    let is_extended = raw >> 31 != 0;
-                    self.daq_id = Some(if is_extended {
-                        Id::extended_truncated(raw)
-                    } else {
-                        Id::standard_truncated(raw)
-                    });
-                }
-            }
-            _ => {}
-        }
-    }
-
-    const fn advance(&mut self, count: Option<u8>) {
-        if let (Some((extension, address)), Some(count)) = (self.mta, count) {
-            self.mta = Some((extension, address.wrapping_add(count as u32)));
         }
     }
 
     fn packet(&self, record: &TraceRecord, data: &[u8]) -> Event {
         let mut event = slave_event(Protocol::Xcp, record, self.parties, EventKind::Periodic, "DAQ");
-        let order = self.order.unwrap_or(ByteOrder::Little);
-        let packet = match self.layout.read(data, &self.lists, order) {
-            Ok(packet) if self.order.is_some() => packet,
+        let order = self.state.order.unwrap_or(ByteOrder::Little);
+        let packet = match self.state.layout.read(data, &self.state.lists, order) {
+            Ok(packet) if self.state.order.is_some() => packet,
             read => {
                 event.fields.push(Field::hex("pid", data[0], 2));
                 event.fields.push(Field::bytes("data", &data[1..]));
@@ -508,10 +336,16 @@ impl Slave {
             event.fields.push(Field::text("overload", "data were lost before it"));
         }
         if let Some(stamp) = packet.stamp.filter(|stamp| !stamp.is_empty()) {
-            event.fields.push(self.layout.stamp_field(stamp, order));
+            event.fields.push(self.state.layout.stamp_field(stamp, order));
         }
         for (entry, bytes) in packet.entries {
-            crate::a2l::push_entry(&mut event.fields, self.description.as_deref(), entry, bytes, self.order);
+            crate::a2l::push_entry(
+                &mut event.fields,
+                self.description.as_deref(),
+                entry,
+                bytes,
+                self.state.order,
+            );
         }
         event
     }

@@ -91,7 +91,8 @@ impl Memory for Ecu {
     }
 
     fn write(&mut self, extension: u8, address: u32, bytes: &[u8]) -> bool {
-        let Some(range) = place(PARAMETERS_AT, WRITABLE, address, bytes.len()).filter(|_| extension == 0) else {
+        let Some(range) = place(PARAMETERS_AT, WRITABLE, address, bytes.len()).filter(|_| extension == 0)
+        else {
             return false;
         };
         self.parameters[range].copy_from_slice(bytes);

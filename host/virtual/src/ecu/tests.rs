@@ -71,7 +71,10 @@ fn it_answers_and_samples_until_it_is_disconnected() {
     assert_eq!(ask(&mut bus, &mut now_ns, &[0xDD, 1]), [0xFF]);
     let due_ns = bus.due(now_ns).unwrap();
     let packet = bus.bid(due_ns).unwrap();
-    assert_eq!((packet.data().len(), packet.data()[0], packet.data()[5..].to_vec()), (7, 0, vec![0xA0, 0x0F]));
+    assert_eq!(
+        (packet.data().len(), packet.data()[0], packet.data()[5..].to_vec()),
+        (7, 0, vec![0xA0, 0x0F])
+    );
     bus.take(due_ns);
     now_ns = due_ns + MS_NS;
     assert_eq!(ask(&mut bus, &mut now_ns, &[0xFE]), [0xFF]);

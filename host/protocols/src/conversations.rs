@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cantap_signals::Decoder;
-use cantap_trace::TraceRecord;
-use rustc_hash::FxHashMap;
+use cantap_trace::{Id, TraceRecord};
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::calibration::Known;
 use crate::canopen::{CanOpen, Sheet};
@@ -19,7 +19,7 @@ use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
 use crate::watch::Begun;
 use crate::xcp::Xcp;
-use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
+use crate::{Assembler, Event, Evidence, Party, Protocol, UnderWay};
 
 /// What to decode.
 #[derive(Clone, Debug, Default)]
@@ -51,6 +51,8 @@ pub struct Conversations {
     wanted: u16,
     /// Channels that do not, or not yet, have diagnostics.
     doubts: FxHashMap<u8, Doubt>,
+    /// Channels and identifiers of connections of XCP and CCP.
+    calibrated: FxHashSet<(u8, Id)>,
 }
 
 /// What looks like diagnostics on a channel, but may be other traffic.
@@ -121,6 +123,7 @@ impl Conversations {
             of_channel: Box::new([0; 256]),
             wanted,
             doubts,
+            calibrated: FxHashSet::default(),
         };
         this.assign(options);
         this
@@ -141,6 +144,7 @@ impl Conversations {
         let before = events.len();
         self.read(record, self.of_channel[usize::from(record.channel)] & !OF_DIAGNOSTICS, events);
         events.extend(said);
+        self.leave_out_calibration(before, events);
         self.hold_back(before, events);
     }
 
@@ -191,6 +195,7 @@ impl Conversations {
         let before = events.len();
         self.read(record, readers, events);
         if events.len() > before {
+            self.leave_out_calibration(before, events);
             self.keep_wanted(before, events);
             self.hold_back(before, events);
         }
@@ -220,6 +225,7 @@ impl Conversations {
         if let Some(family) = &mut self.family {
             family.finish(events);
         }
+        self.leave_out_calibration(before, events);
         self.keep_wanted(before, events);
         self.hold_back(before, events);
     }
@@ -234,6 +240,31 @@ impl Conversations {
         });
         under_way.sort_by_key(|transfer| transfer.start_ns);
         under_way
+    }
+
+    /// Removes new events of diagnostics about frames of XCP and CCP: their data packets begin with any number, as those of ISO 15765-2 do.
+    fn leave_out_calibration(&mut self, before: usize, events: &mut Vec<Event>) {
+        for event in &events[before..] {
+            if event.protocol.bit() & Protocol::CALIBRATION != 0 {
+                let ids = [event.from, event.to].into_iter().filter_map(|party| match party {
+                    Party::Id(id) => Some((event.channel, id)),
+                    _ => None,
+                });
+                self.calibrated.extend(ids);
+            }
+        }
+        if self.calibrated.is_empty() {
+            return;
+        }
+        for event in events.split_off(before) {
+            let has = |party: Party| match party {
+                Party::Id(id) | Party::Addressed(id, _) => self.calibrated.contains(&(event.channel, id)),
+                _ => false,
+            };
+            if !event.protocol.is_diagnostics() || !(has(event.from) || has(event.to)) {
+                events.push(event);
+            }
+        }
     }
 
     /// Holds back new events of diagnostics on channels where nothing has shown yet that it is them.

@@ -8,7 +8,7 @@ use crate::ccp::signs::SessionFinder;
 use crate::devicenet::DeviceNetSigns;
 use crate::j1939::{self, Header};
 use crate::xcp::signs::ConnectFinder;
-use crate::{Protocol, nmea2000};
+use crate::{Event, Party, Protocol, nmea2000};
 
 /// Counts on one channel.
 #[derive(Clone, Debug, Default)]
@@ -67,6 +67,15 @@ impl Signs {
             of |= Protocol::Ccp.bit();
         }
         of
+    }
+
+    /// Whether an event is about the frames of a connection of XCP or CCP, which may look like transfers of ISO 15765-2.
+    pub fn is_calibration(&self, event: &Event) -> bool {
+        let has = |party: Party| match party {
+            Party::Id(id) | Party::Addressed(id, _) => self.xcp.has(id) || self.ccp.has(id),
+            _ => false,
+        };
+        has(event.from) || has(event.to)
     }
 
     /// Forgets the counts of what other traffic contradicts, and of what there was nothing of; returns whether any are left.

@@ -30,5 +30,5 @@ pub fn canopen(channel: usize) -> Schedule {
 
 /// What the ECU that is measured and calibrated sends on a channel's bus: it is on the first.
 pub fn ecu(channel: usize) -> Schedule {
-    if channel == 0 { Schedule::Nodes(Box::new(EcuBus::new())) } else { Schedule::Silent }
+    if channel == 0 { Schedule::Nodes(Box::new(EcuBus::in_use())) } else { Schedule::Silent }
 }

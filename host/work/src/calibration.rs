@@ -215,7 +215,7 @@ impl<'d> Master<'d> {
             max_cto: max_cto.into(),
             max_dto: order.number(&[first, second]) as usize,
         });
-        ensure!(mode >> 1 & 3 == 0, "the ECU counts addresses in words, which is not supported");
+        ensure!(mode & 6 == 0, "the ECU counts addresses in words, which is not supported");
         ensure!(
             protocol == 1 && transport == 1 && max_cto >= 8 && order.number(&[first, second]) >= 8,
             "the ECU's answer to CONNECT is not XCP 1.x on CAN: version {protocol} and {transport}, packets of {max_cto} and {} bytes",
@@ -441,7 +441,9 @@ impl<'d> Master<'d> {
         } else {
             let mut frames = vec![vec![command::START_STOP_SYNCH, 0], vec![command::DISCONNECT]];
             if self.options.is_padded {
-                frames.iter_mut().for_each(|frame| frame.resize(8, 0));
+                for frame in &mut frames {
+                    frame.resize(8, 0);
+                }
             }
             frames
         };

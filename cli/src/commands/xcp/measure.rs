@@ -214,7 +214,7 @@ mod tests {
 
     fn packet(odt: i64, field: Field) -> Event {
         let frame = "7F1#00".parse().unwrap();
-        let event = cantap::TraceEvent::Frame { frame, direction: cantap::trace::Direction::Rx, late: false };
+        let event = cantap::TraceEvent::Frame { frame, direction: cantap_trace::Direction::Rx, late: false };
         let record = cantap::TraceRecord { time_ns: odt, device_ns: None, channel: 1, event };
         let mut event = Event::new(Protocol::Xcp, &record, EventKind::Periodic, "DAQ");
         event.from = Party::Id(Id::standard_truncated(0x7F1));

@@ -176,19 +176,17 @@ impl Rows {
             }
             Form::Csv => {
                 if is_first {
-                    let stamp = if self.has_stamp { ",stamp_us" } else { "" };
-                    let names: String =
-                        self.columns.iter().map(|name| format!(",{}", quoted(name))).collect();
-                    writeln!(out, "time_s{stamp}{names}")?;
+                    let mut head = vec!["time_s".to_owned()];
+                    head.extend(self.has_stamp.then(|| "stamp_us".to_owned()));
+                    head.extend(self.columns.iter().map(|name| quoted(name)));
+                    writeln!(out, "{}", head.join(","))?;
                 }
-                let stamp = match (self.has_stamp, row.stamp_us) {
-                    (true, Some(stamp_us)) => format!(",{stamp_us}"),
-                    (true, None) => ",".to_owned(),
-                    (false, _) => String::new(),
-                };
-                let cells = row.values.iter().map(|field| field.as_ref().map_or_else(String::new, cell));
-                let cells: String = cells.map(|cell| format!(",{cell}")).collect();
-                writeln!(out, "{seconds:.6}{stamp}{cells}")?;
+                let mut cells = vec![format!("{seconds:.6}")];
+                if self.has_stamp {
+                    cells.push(row.stamp_us.map_or_else(String::new, |stamp_us| stamp_us.to_string()));
+                }
+                cells.extend(row.values.iter().map(|field| field.as_ref().map_or_else(String::new, cell)));
+                writeln!(out, "{}", cells.join(","))?;
             }
             Form::Text => {
                 let width = |name: &str| name.chars().count().clamp(14, WIDEST);

@@ -60,7 +60,7 @@ impl Texts {
     pub fn number_of(&self, text: &str) -> Option<f64> {
         let mut found = self.ranges.iter().filter(|(_, _, known)| known.eq_ignore_ascii_case(text));
         let (from, to, _) = found.next()?;
-        (from == to && found.next().is_none()).then_some(*from)
+        (from >= to && found.next().is_none()).then_some(*from)
     }
 }
 
@@ -118,8 +118,9 @@ fn inverse([a, b, c, d, e, f]: &[f64; 6], number: f64) -> Option<f64> {
 /// The value at a place between points; beyond them, that of the nearest.
 fn point_at(points: &[(f64, f64)], is_interpolated: bool, at: f64) -> Option<f64> {
     let place = points.partition_point(|(known, _)| *known < at);
+    // It is not below, so that it is the place itself if it is not above.
     if let Some((known, value)) = points.get(place)
-        && *known == at
+        && *known <= at
     {
         return Some(*value);
     }

@@ -69,7 +69,9 @@ fn flatten<'a>(data: &'a GenericIfData, depth: usize, out: &mut Vec<Token<'a>>) 
         | Data::Sequence(items)
         | Data::Struct(_, _, items)
         | Data::Block { items, .. } => {
-            items.iter().for_each(|item| flatten(item, depth + 1, out));
+            for item in items {
+                flatten(item, depth + 1, out);
+            }
         }
         Data::TaggedStruct(tags) | Data::TaggedUnion(tags) => {
             let mut items: Vec<_> = tags.values().flatten().collect();

@@ -46,42 +46,53 @@ impl Description {
             return Err(A2lError::TooLarge);
         }
         let text = decode(&std::fs::read(path)?);
-        if !text.contains("/include") {
+        if !includes(&text) {
             return Self::parse(&text);
         }
         match a2lfile::load(path, None, false) {
-            Ok((file, _)) => of_file(&file, Vec::new()),
-            Err(error) => {
-                let note = format!("without what it includes: {error}");
-                Self::parse_with(&text, vec![note])
-            }
+            Ok((file, _)) => of_file(&file, &[]),
+            Err(error) => Self::parse_bare(&text, &format!("without what it includes: {error}")),
         }
     }
 
-    /// Reads the text of a file. What it includes is left out.
+    /// Reads the text of a file, or of what is within its MODULE. What it includes is left out.
     ///
     /// # Errors
     ///
     /// It is no A2L.
     pub fn parse(text: &str) -> Result<Vec<Self>, A2lError> {
-        Self::parse_with(text, Vec::new())
+        if includes(text) {
+            return Self::parse_bare(text, "files that it includes are left out");
+        }
+        match a2lfile::load_from_string(text, None, false) {
+            Ok((file, _)) => of_file(&file, &[]),
+            Err(error) => Self::parse_bare(text, &format!("without its A2ML: {error}")),
+        }
     }
 
-    fn parse_with(text: &str, mut issues: Vec<String>) -> Result<Vec<Self>, A2lError> {
-        if !text.contains("/include")
-            && let Ok((file, _)) = a2lfile::load_from_string(text, None, false)
+    /// Without all that is not needed, and more often wrong than the rest: files that are included, the grammar of IF_DATA, the project's name.
+    fn parse_bare(text: &str, issue: &str) -> Result<Vec<Self>, A2lError> {
+        let bare = without_project_name(&without_includes(&without_a2ml(text)));
+        let error = match a2lfile::load_from_string(&bare, None, false) {
+            Ok((file, _)) => return of_file(&file, &[shown(issue)]),
+            Err(error) => error,
+        };
+        if !bare.contains("/begin PROJECT")
+            && let Ok(module) = a2lfile::load_fragment(&bare, None)
         {
-            return of_file(&file, issues);
+            let one = Loader { module: &module, issues: Vec::new() }.load();
+            // A file of something else is a fragment without anything in it.
+            if !one.objects().is_empty() {
+                return Ok(vec![one]);
+            }
         }
-        // The grammar of IF_DATA is not needed, and more often wrong than the rest.
-        let bare = without_includes(&without_a2ml(text));
-        let (file, _) = a2lfile::load_from_string(&bare, None, false)
-            .map_err(|error| A2lError::Malformed(error.to_string()))?;
-        if text.contains("/include") && issues.is_empty() {
-            issues.push("files that it includes are left out".to_owned());
-        }
-        of_file(&file, issues)
+        Err(A2lError::Malformed(shown(&error.to_string())))
     }
+}
+
+/// Whether other files are included.
+fn includes(text: &str) -> bool {
+    text.contains("/include") || text.contains("/INCLUDE")
 }
 
 /// A text of the file, as it can be shown.
@@ -118,7 +129,8 @@ fn without_a2ml(text: &str) -> String {
 /// Without directives that include other files.
 fn without_includes(text: &str) -> String {
     let (mut out, mut rest) = (String::with_capacity(text.len()), text);
-    while let Some(at) = rest.find("/include") {
+    let next = |rest: &str| [rest.find("/include"), rest.find("/INCLUDE")].into_iter().flatten().min();
+    while let Some(at) = next(rest) {
         out.push_str(&rest[..at]);
         let after = rest[at + "/include".len()..].trim_start();
         rest = match after.strip_prefix('"') {
@@ -130,9 +142,20 @@ fn without_includes(text: &str) -> String {
     out
 }
 
-fn of_file(file: &A2lFile, issues: Vec<String>) -> Result<Vec<Description>, A2lError> {
+/// With another name for the project: nobody needs it, and it is where names are that the standard does not allow.
+fn without_project_name(text: &str) -> String {
+    let begin = "/begin PROJECT";
+    let Some(at) = text.find(begin) else { return text.to_owned() };
+    let (before, after) = text.split_at(at + begin.len());
+    let name = after.trim_start();
+    let end =
+        name.find(|character: char| character.is_whitespace() || character == '"').unwrap_or(name.len());
+    format!("{before} Project {}", &name[end..])
+}
+
+fn of_file(file: &A2lFile, issues: &[String]) -> Result<Vec<Description>, A2lError> {
     let all: Vec<_> =
-        file.project.module.iter().map(|module| Loader { module, issues: issues.clone() }.load()).collect();
+        file.project.module.iter().map(|module| Loader { module, issues: issues.to_vec() }.load()).collect();
     if all.is_empty() { Err(A2lError::Empty) } else { Ok(all) }
 }
 
@@ -205,15 +228,15 @@ impl Loader<'_> {
         }
         let instances = self.module.instance.len();
         if instances > 0 {
-            self.issue(format!("{instances} instances of structures are left out"));
+            self.issue(&format!("{instances} instances of structures are left out"));
         }
         description.issues = self.issues;
         description
     }
 
-    fn issue(&mut self, issue: String) {
+    fn issue(&mut self, issue: &str) {
         if self.issues.len() < MOST_ISSUES {
-            self.issues.push(shown(&issue));
+            self.issues.push(shown(issue));
         } else if self.issues.len() == MOST_ISSUES {
             self.issues.push("there is more that is left out".to_owned());
         }
@@ -241,7 +264,7 @@ impl Loader<'_> {
         let order = match self.order(from.byte_order.as_ref(), data_type.size()) {
             Ok(order) => order,
             Err(why) => {
-                self.issue(format!("{name}: {why}"));
+                self.issue(&format!("{name}: {why}"));
                 return None;
             }
         };
@@ -272,7 +295,7 @@ impl Loader<'_> {
         let is_text = from.characteristic_type == CharacteristicType::Ascii;
         let is_single = from.characteristic_type == CharacteristicType::Value;
         if !is_text && !is_single && from.characteristic_type != CharacteristicType::ValBlk {
-            self.issue(format!("{name}: curves and maps are left out"));
+            self.issue(&format!("{name}: curves and maps are left out"));
             return None;
         }
         if from.virtual_characteristic.is_some() {
@@ -284,14 +307,14 @@ impl Loader<'_> {
             Some(values) if values.position <= 1 => type_of(values.datatype),
             _ if is_text => DataType::Unsigned(1),
             _ => {
-                self.issue(format!("{name}: its RECORD_LAYOUT does not begin with its values"));
+                self.issue(&format!("{name}: its RECORD_LAYOUT does not begin with its values"));
                 return None;
             }
         };
         let order = match self.order(from.byte_order.as_ref(), data_type.size()) {
             Ok(order) => order,
             Err(why) => {
-                self.issue(format!("{name}: {why}"));
+                self.issue(&format!("{name}: {why}"));
                 return None;
             }
         };
@@ -322,7 +345,7 @@ impl Loader<'_> {
             return (Conversion::Identical, Texts::default(), String::new());
         }
         let Some(method) = self.module.compu_method.get(name) else {
-            self.issue(format!("{object}: there is no COMPU_METHOD {name}"));
+            self.issue(&format!("{object}: there is no COMPU_METHOD {name}"));
             return (Conversion::Unknown, Texts::default(), String::new());
         };
         let table = method.compu_tab_ref.as_ref().map(|table| table.conversion_table.as_str());
@@ -347,7 +370,7 @@ impl Loader<'_> {
             } else {
                 "table or coefficients"
             };
-            self.issue(format!("{object}: the {kind} of {name} is not evaluated"));
+            self.issue(&format!("{object}: the {kind} of {name} is not evaluated"));
         }
         let unit = if method.unit == "-" { String::new() } else { shown(&method.unit) };
         // A default for all other numbers would hide every value.

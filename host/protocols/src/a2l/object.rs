@@ -118,7 +118,7 @@ impl Object {
         };
         let mut masked = raw & bits.mask;
         if bits.is_signed && bits.mask != 0 {
-            let top = 63 - bits.mask.leading_zeros();
+            let top = bits.mask.ilog2();
             if masked >> top & 1 == 1 {
                 masked |= u64::MAX.checked_shl(top).unwrap_or(0);
             }
@@ -180,19 +180,18 @@ impl Object {
             Conversion::Texts(texts) => texts.number_of(text),
             _ => None,
         };
-        let number = match of_texts {
-            Some(number) => number,
-            None => {
-                let value: f64 = text.parse().map_err(|_| ValueError::NotAValue(text.to_owned()))?;
-                let (least, most) = self.limits;
-                // A description without limits has the same number twice.
-                if least < most && !(least..=most).contains(&value) {
-                    return Err(ValueError::OutOfLimits(least, most));
-                }
-                match &self.conversion {
-                    Conversion::Texts(_) => value,
-                    conversion => conversion.number(value).ok_or(ValueError::NoNumber)?,
-                }
+        let number = if let Some(number) = of_texts {
+            number
+        } else {
+            let value: f64 = text.parse().map_err(|_| ValueError::NotAValue(text.to_owned()))?;
+            let (least, most) = self.limits;
+            // A description without limits has the same number twice.
+            if least < most && !(least..=most).contains(&value) {
+                return Err(ValueError::OutOfLimits(least, most));
+            }
+            match &self.conversion {
+                Conversion::Texts(_) => value,
+                conversion => conversion.number(value).ok_or(ValueError::NoNumber)?,
             }
         };
         let size = self.data_type.size();

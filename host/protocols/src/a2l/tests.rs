@@ -108,6 +108,11 @@ fn a_wrong_grammar_of_if_data_or_a_missing_file_is_no_obstacle() {
     let description = Description::parse(&including).unwrap().remove(0);
     assert_eq!(description.objects().len(), ecu().objects().len());
     assert!(description.issues[0].contains("includes"), "{:?}", description.issues);
+    let named = ECU.replace("PROJECT Demo", "PROJECT Demo-2");
+    assert_eq!(Description::parse(&named).unwrap()[0].objects().len(), ecu().objects().len());
+    let (_, module) = ECU.split_once("/begin MODULE Ecu \"\"").unwrap();
+    let (module, _) = module.split_once("/end MODULE").unwrap();
+    assert_eq!(Description::parse(module).unwrap()[0].objects().len(), ecu().objects().len());
     assert!(Description::parse("").is_err() && Description::parse("no A2L at all").is_err());
 }
 

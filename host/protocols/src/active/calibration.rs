@@ -220,14 +220,13 @@ impl CalibrationCommand {
     }
 
     /// Waits, unless that has gone on for too long.
-    fn wait(&mut self, now_ns: u64, time_ns: u64) -> bool {
+    fn wait(&mut self, now_ns: u64, time_ns: u64) {
         let begun_ns = self.begun_ns.unwrap_or(now_ns);
         if now_ns.saturating_sub(begun_ns) >= self.request.patience_ns {
             self.fail(CommandError::Busy { after_ms: self.request.patience_ns / 1_000_000 });
-            return false;
+            return;
         }
         self.until_ns = Some(now_ns.saturating_add(time_ns));
-        true
     }
 
     fn hear_xcp(&mut self, now_ns: u64, data: &[u8]) {
@@ -238,9 +237,8 @@ impl CalibrationCommand {
             }
             (&[xcp::EV, xcp::EV_SESSION_TERMINATED, ..], _) => self.fail(CommandError::Terminated),
             (&[xcp::ERR, xcp::error::CMD_BUSY, ..], Step::Asked) => {
-                if self.wait(now_ns, BUSY_NS) {
-                    self.step = Step::Busy;
-                }
+                self.wait(now_ns, BUSY_NS);
+                self.step = Step::Busy;
             }
             (&[xcp::ERR, code, ..], Step::Asked) => self.fail(CommandError::Refused { code }),
             (&[xcp::ERR], Step::Asked) => self.fail(CommandError::TooShort { expected: 2, got: 1 }),
@@ -278,9 +276,8 @@ impl CalibrationCommand {
             0 => self.end = Some(Ok(rest.to_vec())),
             // Processors that are busy, and time-outs within the ECU.
             0x10..=0x12 => {
-                if self.wait(now_ns, BUSY_NS) {
-                    self.step = Step::Busy;
-                }
+                self.wait(now_ns, BUSY_NS);
+                self.step = Step::Busy;
             }
             code => self.fail(CommandError::Refused { code }),
         }

@@ -111,7 +111,7 @@ impl Waiting {
 /// and starting are four commands, each with its response.
 pub fn is_short_gap(record: &TraceRecord) -> Option<bool> {
     is_gap(&record.event)
-        .then(|| matches!(record.event, TraceEvent::Lost { count: 0..8, at_least: false, .. }))
+        .then_some(matches!(record.event, TraceEvent::Lost { count: 0..8, at_least: false, .. }))
 }
 
 /// An event about a frame of a slave.

@@ -29,10 +29,10 @@ pub trait Connection {
     fn known(known: &Known) -> Vec<MasterSlave>;
 
     /// A frame of the master.
-    fn from_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>);
+    fn hear_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>);
 
     /// A frame of the slave.
-    fn from_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>);
+    fn hear_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>);
 
     /// An identifier of its own that the slave's data packets have got.
     fn take_daq_id(&mut self) -> Option<Id>;
@@ -61,7 +61,7 @@ pub struct Connections<C: Connection> {
     descriptions: Option<Arc<Descriptions>>,
     finder: C::Finder,
     /// By channel and number.
-    connections: BTreeMap<(u8, usize), C>,
+    all: BTreeMap<(u8, usize), C>,
     /// The connection and side of each identifier.
     users: FxHashMap<(u8, Id), (usize, Side)>,
     sweep_ns: i64,
@@ -74,7 +74,7 @@ impl<C: Connection> Connections<C> {
             known: C::known(&known),
             descriptions: known.descriptions,
             finder: C::Finder::default(),
-            connections: BTreeMap::new(),
+            all: BTreeMap::new(),
             users: FxHashMap::default(),
             sweep_ns: i64::MIN,
         }
@@ -86,12 +86,12 @@ impl<C: Connection> Connections<C> {
     }
 
     fn connect(&mut self, channel: u8, parties: MasterSlave) -> Option<usize> {
-        let number = self.connections.len();
+        let number = self.all.len();
         if number >= MOST_CONNECTIONS {
             return None;
         }
         let description = self.descriptions.as_ref().and_then(|all| all.of(parties));
-        self.connections.insert((channel, number), C::new(parties, description));
+        self.all.insert((channel, number), C::new(parties, description));
         self.users.insert((channel, parties.master), (number, Side::Master));
         self.users.insert((channel, parties.slave), (number, Side::Slave));
         Some(number)
@@ -121,10 +121,10 @@ impl<C: Connection> Connections<C> {
             }
             return;
         };
-        let Some(connection) = self.connections.get_mut(&(channel, number)) else { return };
+        let Some(connection) = self.all.get_mut(&(channel, number)) else { return };
         match side {
-            Side::Master => connection.from_master(record, data, events),
-            Side::Slave => connection.from_slave(record, data, events),
+            Side::Master => connection.hear_master(record, data, events),
+            Side::Slave => connection.hear_slave(record, data, events),
         }
         if let Some(id) = connection.take_daq_id() {
             self.users.entry((channel, id)).or_insert((number, Side::Slave));
@@ -134,9 +134,9 @@ impl<C: Connection> Connections<C> {
 
 impl<C: Connection> Assembler for Connections<C> {
     fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
-        if record.time_ns >= self.sweep_ns && !self.connections.is_empty() {
+        if record.time_ns >= self.sweep_ns && !self.all.is_empty() {
             self.sweep_ns = record.time_ns.saturating_add(SWEEP_NS);
-            for (&(channel, _), connection) in &mut self.connections {
+            for (&(channel, _), connection) in &mut self.all {
                 connection.sweep(record.time_ns, channel, events);
             }
         }
@@ -146,13 +146,13 @@ impl<C: Connection> Assembler for Connections<C> {
             }
         } else if let Some(is_short) = is_short_gap(record) {
             let channel = record.channel;
-            let of_channel = self.connections.range_mut((channel, 0)..=(channel, usize::MAX));
+            let of_channel = self.all.range_mut((channel, 0)..=(channel, usize::MAX));
             of_channel.for_each(|(_, connection)| connection.gap(is_short, channel, events));
         }
     }
 
     fn finish(&mut self, events: &mut Vec<Event>) {
-        for (&(channel, _), connection) in &mut self.connections {
+        for (&(channel, _), connection) in &mut self.all {
             connection.finish(channel, events);
         }
     }

@@ -45,11 +45,16 @@ impl<F: ConnectionFinder> ConnectionSigns<F> {
             }
             Sign::Plausible => true,
             Sign::None => {
-                let is_part = self.found.iter().any(|one| one.master == id || one.slave == id);
+                let is_part = self.has(id);
                 self.count += u32::from(is_part);
                 is_part
             }
         }
+    }
+
+    /// Whether frames with this identifier are those of a connection that was found.
+    pub fn has(&self, id: Id) -> bool {
+        self.found.iter().any(|one| one.master == id || one.slave == id)
     }
 
     /// The number of frames that indicate it.

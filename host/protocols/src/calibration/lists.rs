@@ -42,7 +42,7 @@ pub struct List {
 /// The lists of a slave.
 #[derive(Clone, Debug, Default)]
 pub struct Lists {
-    lists: BTreeMap<u16, List>,
+    all: BTreeMap<u16, List>,
     /// Where the next entry is written: list, packet, entry.
     pointer: Option<(u16, u8, u8)>,
     entries: usize,
@@ -72,25 +72,25 @@ impl Lists {
     /// After a gap: what was being set up is not known any more. If `is_short`, there was no time for a list that runs to be set up anew.
     pub fn gap(&mut self, is_short: bool) {
         self.pointer = None;
-        self.lists.retain(|_, list| is_short && list.is_running);
+        self.all.retain(|_, list| is_short && list.is_running);
         self.count();
     }
 
     fn count(&mut self) {
-        self.entries = self.lists.values().flat_map(|list| &list.odts).map(Vec::len).sum();
+        self.entries = self.all.values().flat_map(|list| &list.odts).map(Vec::len).sum();
     }
 
     /// A list by its number, made if it is new and there is room.
     pub fn list(&mut self, number: u16) -> Option<&mut List> {
-        if self.lists.len() >= MOST_LISTS && !self.lists.contains_key(&number) {
+        if self.all.len() >= MOST_LISTS && !self.all.contains_key(&number) {
             return None;
         }
-        Some(self.lists.entry(number).or_default())
+        Some(self.all.entry(number).or_default())
     }
 
     /// All of them, by number.
     pub fn all(&mut self) -> impl Iterator<Item = (&u16, &mut List)> {
-        self.lists.iter_mut()
+        self.all.iter_mut()
     }
 
     /// Whether the pointer is somewhere.
@@ -100,12 +100,12 @@ impl Lists {
 
     /// A list by its number.
     pub fn get(&self, number: u16) -> Option<&List> {
-        self.lists.get(&number)
+        self.all.get(&number)
     }
 
     /// The list that sends packets with this identifier, and which of its packets that is. Lists that run come first.
     pub fn of_pid(&self, pid: u8) -> Option<(u16, u8, &List)> {
-        let places = self.lists.iter().filter_map(|(number, list)| {
+        let places = self.all.iter().filter_map(|(number, list)| {
             let odt = pid.checked_sub(list.first_pid?)?;
             (usize::from(odt) < list.packets()).then_some((*number, odt, list))
         });
@@ -204,6 +204,6 @@ mod tests {
             lists.allocate_packets(number, 255);
             lists.allocate_entries(number, 0, 255);
         }
-        assert!(lists.entries <= MOST_ENTRIES && lists.lists.len() <= MOST_LISTS);
+        assert!(lists.entries <= MOST_ENTRIES && lists.all.len() <= MOST_LISTS);
     }
 }

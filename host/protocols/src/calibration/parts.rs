@@ -79,7 +79,7 @@ pub fn push_parts(fields: &mut Vec<Field>, parts: &[Part], mut data: &[u8], orde
             (Part::Skip(_), _) => {}
             (Part::Rest(_), _) if bytes.is_empty() => {}
             (Part::Number(name, _), Some(order)) => {
-                fields.push(Field::number(name, order.number(bytes) as i64))
+                fields.push(Field::number(name, order.number(bytes) as i64));
             }
             (Part::Hex(name, size), Some(order)) => {
                 fields.push(Field::hex(name, order.number(bytes), 2 * size as u8));

@@ -44,7 +44,7 @@ impl Connection for Slave {
         known.ccp.iter().copied().chain(described).collect()
     }
 
-    fn from_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
+    fn hear_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
         if data.len() < 2 {
             return;
         }
@@ -53,7 +53,7 @@ impl Connection for Slave {
         }
     }
 
-    fn from_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
+    fn hear_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
         match *data {
             [codec::COMMAND_RETURN, code, counter, ref rest @ ..] => {
                 self.answer(record, code, counter, rest, events);
@@ -200,15 +200,11 @@ impl Slave {
         let byte = |at: usize| asked.get(at).copied().unwrap_or_default();
         let daq = u16::from(byte(2));
         match asked[0] {
-            command::SET_MTA => {
-                if byte(2) == 0 {
-                    self.mta = self.address_in(asked, 3);
-                }
-            }
+            command::SET_MTA if byte(2) == 0 => self.mta = self.address_in(asked, 3),
             command::UPLOAD | command::DNLOAD => self.advance(byte(2)),
             command::DNLOAD_6 => self.advance(6),
             command::CONNECT | 0x0E | 0x18 | 0x19 | 0x22 | 0x20 | 0x21 | command::EXCHANGE_ID => {
-                self.mta = None
+                self.mta = None;
             }
             command::DISCONNECT => {
                 self.mta = None;

@@ -57,7 +57,7 @@ impl CcpServer {
             _ if !self.is_connected => return None,
             _ => {}
         }
-        let (code, result) = match self.answer(&data, memory) {
+        let (code, result) = match self.answer(data, memory) {
             Ok(result) => (0, result),
             Err(code) => (code, Vec::new()),
         };
@@ -66,7 +66,7 @@ impl CcpServer {
         Some(answer)
     }
 
-    fn answer(&mut self, data: &[u8; 8], memory: &mut dyn Memory) -> Result<Vec<u8>, u8> {
+    fn answer(&mut self, data: [u8; 8], memory: &mut dyn Memory) -> Result<Vec<u8>, u8> {
         let address = |at: usize| (data[at], ORDER.number(&data[at + 1..at + 5]) as u32);
         let daq = u16::from(data[2]);
         let next = |mta: (u8, u32)| [&[mta.0][..], &ORDER.bytes(mta.1.into(), 4)].concat();

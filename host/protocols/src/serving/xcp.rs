@@ -32,11 +32,11 @@ const MOST_PACKETS: usize = 252;
 const CALIBRATION: u8 = 0x01;
 const DAQ: u8 = 0x04;
 const STAMPED: u8 = 0x10;
-/// Where GET_ID puts what it identifies with.
-#[derive(Clone, Copy, Debug)]
+/// Where the memory transfer address is: in the memory, or within a text that was asked for.
+#[derive(Clone, Debug)]
 enum Mta {
     Memory(u8, u32),
-    Identification(usize),
+    Text(Vec<u8>, usize),
 }
 
 /// A slave.
@@ -129,7 +129,7 @@ impl XcpServer {
             command::GET_COMM_MODE_INFO => Ok(vec![0, 1, 0, 43, 0, 0, 0x10]),
             command::GET_ID => {
                 let length = if byte(1)? <= 2 { self.identification.len() } else { 0 };
-                self.mta = Some(Mta::Identification(0));
+                self.mta = Some(Mta::Text(self.identification.clone().into_bytes(), 0));
                 Ok([&[0, 0, 0][..], &ORDER.bytes(length as u64, 4)].concat())
             }
             command::GET_SEED => {
@@ -196,7 +196,7 @@ impl XcpServer {
             command::GET_DAQ_RESOLUTION_INFO => Ok(vec![1, 7, 1, 7, 0x34, 1, 0]),
             command::GET_DAQ_EVENT_INFO => {
                 let event = self.events.get(usize::from(word(2)?)).ok_or(error::OUT_OF_RANGE)?;
-                self.mta = None;
+                self.mta = Some(Mta::Text(event.name.clone().into_bytes(), 0));
                 Ok(vec![0x04, 0xFF, event.name.len() as u8, event.period_ms, 6, 0])
             }
             command::GET_DAQ_CLOCK => Ok([&[0, 0, 0][..], &self.now_us.to_le_bytes()].concat()),
@@ -318,16 +318,17 @@ impl XcpServer {
 
     fn upload(&mut self, data: &[u8], memory: &dyn Memory) -> Vec<Vec<u8>> {
         let count = data.get(1).map_or(0, |count| usize::from(*count));
-        let bytes = match self.mta {
+        let bytes = match self.mta.take() {
             _ if count == 0 => return vec![frame(Err(error::OUT_OF_RANGE))],
             None => return vec![frame(Err(error::SEQUENCE))],
             Some(Mta::Memory(extension, address)) => {
                 self.mta = Some(Mta::Memory(extension, address.wrapping_add(count as u32)));
                 memory.read(extension, address, count)
             }
-            Some(Mta::Identification(from)) => {
-                self.mta = Some(Mta::Identification(from + count));
-                self.identification.as_bytes().get(from..from + count).map(<[u8]>::to_vec)
+            Some(Mta::Text(text, from)) => {
+                let bytes = text.get(from..from + count).map(<[u8]>::to_vec);
+                self.mta = Some(Mta::Text(text, from + count));
+                bytes
             }
         };
         match bytes {

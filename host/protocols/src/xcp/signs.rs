@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use cantap_trace::{Id, TraceRecord};
+use cantap_trace::{Id, TraceFrame, TraceRecord};
 
 use super::codec::{RES, command};
 use crate::calibration::connection::MasterSlave;
@@ -27,7 +27,7 @@ impl ConnectionFinder for ConnectFinder {
         }
         let oldest_ns = record.time_ns.saturating_sub(RESPONSE_NS);
         self.waiting.retain(|asked| asked.time_ns >= oldest_ns);
-        let id_of = |asked: &TraceRecord| asked.frame().map(|frame| frame.id());
+        let id_of = |asked: &TraceRecord| asked.frame().map(TraceFrame::id);
         if is_connect(data) {
             self.waiting.retain(|asked| asked.channel != record.channel || id_of(asked) != Some(id));
             if self.waiting.len() == MOST_WAITING {

@@ -58,7 +58,7 @@ impl Connection for Slave {
         known.xcp.iter().copied().chain(described).collect()
     }
 
-    fn from_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
+    fn hear_master(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
         let Some(&code) = data.first() else { return };
         if code < LEAST_COMMAND {
             let mut event = Event::new(Protocol::Xcp, record, EventKind::Request, "STIM");
@@ -80,7 +80,7 @@ impl Connection for Slave {
         }
         if !self.state.is_interleaved || self.waiting.len() >= MOST_WAITING {
             while let Some(before) = self.waiting.pop_front() {
-                events.push(self.unanswered(before, record.channel, Trouble::Overlapped));
+                events.push(self.unanswered(&before, record.channel, Trouble::Overlapped));
             }
         }
         let mut waiting = Waiting::new(record, data);
@@ -93,7 +93,7 @@ impl Connection for Slave {
         self.waiting.push_back(waiting);
     }
 
-    fn from_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
+    fn hear_slave(&mut self, record: &TraceRecord, data: &[u8], events: &mut Vec<Event>) {
         match data {
             [] => {}
             [codec::RES, ..] => self.response(record, data, events),
@@ -154,7 +154,7 @@ impl Connection for Slave {
             let Some(mut waiting) = self.waiting.pop_front() else { return };
             waiting.time_ns += limit_ns;
             let after_ms = (limit_ns / 1_000_000) as u32;
-            events.push(self.unanswered(waiting, channel, Trouble::Timeout { after_ms }));
+            events.push(self.unanswered(&waiting, channel, Trouble::Timeout { after_ms }));
         }
     }
 
@@ -176,7 +176,7 @@ impl Connection for Slave {
 
     fn finish(&mut self, channel: u8, events: &mut Vec<Event>) {
         while let Some(waiting) = self.waiting.pop_front() {
-            events.push(self.unanswered(waiting, channel, Trouble::Unfinished));
+            events.push(self.unanswered(&waiting, channel, Trouble::Unfinished));
         }
     }
 }
@@ -304,6 +304,11 @@ impl Slave {
                 return;
             }
         };
+        let is_printable = |byte: &u8| matches!(byte, b' '..=b'~');
+        if code == command::UPLOAD && self.state.is_text && written.iter().all(is_printable) {
+            event.fields.push(Field::text("text", String::from_utf8_lossy(written).into_owned()));
+            return;
+        }
         self.push_memory(at, written, &mut event.fields);
     }
 
@@ -350,7 +355,7 @@ impl Slave {
         event
     }
 
-    fn unanswered(&self, waiting: Waiting, channel: u8, trouble: Trouble) -> Event {
-        no_response(self.event(&waiting, channel, EventKind::NoResponse), trouble)
+    fn unanswered(&self, waiting: &Waiting, channel: u8, trouble: Trouble) -> Event {
+        no_response(self.event(waiting, channel, EventKind::NoResponse), trouble)
     }
 }

@@ -18,6 +18,8 @@ pub struct State {
     pub is_interleaved: bool,
     /// The memory transfer address: extension and address.
     pub mta: Option<(u8, u32)>,
+    /// The memory transfer address is that of a text which the slave has been asked for.
+    pub is_text: bool,
     /// What is measured.
     pub lists: Lists,
     /// How data packets are made.
@@ -33,6 +35,7 @@ impl Default for State {
             granularity: 1,
             is_interleaved: false,
             mta: None,
+            is_text: false,
             lists: Lists::default(),
             layout: PacketLayout::default(),
             daq_id: None,
@@ -73,6 +76,13 @@ impl State {
 
     /// What a command has changed, now that the slave has agreed.
     pub fn apply(&mut self, command: &[u8], response: &[u8]) {
+        match command[0] {
+            command::SET_MTA | command::CONNECT | command::SHORT_UPLOAD | command::SHORT_DOWNLOAD => {
+                self.is_text = false;
+            }
+            command::GET_ID | command::GET_DAQ_EVENT_INFO => self.is_text = true,
+            _ => {}
+        }
         let number = |at| self.number_in(command, at);
         let byte = |at: usize| command.get(at).copied();
         match command[0] {
@@ -134,7 +144,9 @@ impl State {
             }
             command::WRITE_DAQ_MULTIPLE => {
                 let entries: Vec<_> = self.entries_of(command).collect();
-                entries.into_iter().for_each(|entry| self.lists.write(entry));
+                for entry in entries {
+                    self.lists.write(entry);
+                }
             }
             command::SET_DAQ_LIST_MODE => {
                 let event = number(4);

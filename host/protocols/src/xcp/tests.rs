@@ -237,6 +237,21 @@ fn it_is_found_without_being_named_and_nothing_else_is() {
     assert_eq!(found(&moved), [Protocol::Xcp]);
 }
 
+/// A packet with the identifier 10 looks like the first frame of a long message, one with 21 like the next.
+#[test]
+fn packets_with_high_identifiers_are_no_transfers() {
+    let mut frames = vec![(0.0, "7E0#FF00"), (1.0, "7E8#FF05C00808000101")];
+    for round in 0..100_u32 {
+        let ms = 20.0 + f64::from(round) * 10.0;
+        frames.extend([
+            (ms, "7E8#100A220000000000"),
+            (ms + 1.0, "7E8#2122000000000000"),
+            (ms + 2.0, "7E8#0350030000000000"),
+        ]);
+    }
+    assert_eq!(found(&frames), [Protocol::Xcp]);
+}
+
 #[test]
 fn diagnostics_are_not_taken_for_it() {
     let frames =

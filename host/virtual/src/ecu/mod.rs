@@ -120,7 +120,7 @@ fn frame(id: u32, bytes: &[u8]) -> Frame {
 
 impl EcuBus {
     /// The ECU, with nobody connected to it.
-    pub fn new() -> Self {
+    pub fn in_use() -> Self {
         let events = PERIODS_MS.map(|period_ms| ServedEvent { name: format!("{period_ms} ms"), period_ms });
         Self {
             ecu: Ecu::new(),

@@ -46,7 +46,7 @@ fn the_description_is_that_of_the_memory() {
 
 #[test]
 fn it_answers_and_samples_until_it_is_disconnected() {
-    let (mut bus, mut now_ns) = (EcuBus::new(), MS_NS);
+    let (mut bus, mut now_ns) = (EcuBus::in_use(), MS_NS);
     bus.hear(&frame(XCP[0], &[0xFD]), now_ns);
     assert_eq!(bus.due(now_ns), None, "nobody is connected");
     assert_eq!(ask(&mut bus, &mut now_ns, &[0xFF, 0]), [0xFF, 0x05, 0xC0, 8, 8, 0, 1, 1]);

@@ -1,5 +1,6 @@
 //! Descriptions of what is in ECUs' memories (A2L), as users name them.
 
+use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -9,8 +10,18 @@ use cantap_trace::counted;
 
 use crate::report::Reporter;
 
+/// The largest file that is read, in bytes.
+const MOST_BYTES: u64 = 512 << 20;
 /// How many things that are left out are named.
 const MOST_NAMED: usize = 3;
+
+/// The bytes of a file, if it is not too large.
+fn bytes_of(path: &Path) -> anyhow::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?.take(MOST_BYTES + 1).read_to_end(&mut bytes)?;
+    anyhow::ensure!(bytes.len() as u64 <= MOST_BYTES, "it is larger than 512 MiB");
+    Ok(bytes)
+}
 
 /// Reads a file: a description for each ECU in it. How much of it is left out is reported.
 ///
@@ -19,7 +30,11 @@ const MOST_NAMED: usize = 3;
 /// It cannot be read, or is no A2L.
 pub fn read(path: &Path, reporter: &Reporter) -> anyhow::Result<Vec<Description>> {
     let name = path.display();
-    let descriptions = Description::read(path).with_context(|| name.to_string())?;
+    let bytes = bytes_of(path).with_context(|| format!("cannot read {name}"))?;
+    // What a file includes is named from where it is.
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let mut include = |name: &str| bytes_of(&folder.join(name.replace('\\', "/"))).ok();
+    let descriptions = Description::read(&bytes, &mut include).with_context(|| name.to_string())?;
     let issues: Vec<_> = descriptions.iter().flat_map(|one| &one.issues).map(String::as_str).collect();
     if !issues.is_empty() {
         let named = issues[..issues.len().min(MOST_NAMED)].join("; ");

@@ -115,7 +115,7 @@ fn inverse([a, b, c, d, e, f]: &[f64; 6], number: f64) -> Option<f64> {
     (divisor != 0.0).then(|| (c - f * number) / divisor)
 }
 
-/// The value at a place between points; beyond them, that of the nearest.
+/// The value at a place between points; beyond them there is none.
 fn point_at(points: &[(f64, f64)], is_interpolated: bool, at: f64) -> Option<f64> {
     let place = points.partition_point(|(known, _)| *known < at);
     // It is not below, so that it is the place itself if it is not above.
@@ -129,8 +129,7 @@ fn point_at(points: &[(f64, f64)], is_interpolated: bool, at: f64) -> Option<f64
     }
     match (place.checked_sub(1).and_then(|before| points.get(before)), points.get(place)) {
         (Some((x0, y0)), Some((x1, y1))) => Some(y0 + (y1 - y0) * (at - x0) / (x1 - x0)),
-        (Some((_, value)), None) | (None, Some((_, value))) => Some(*value),
-        (None, None) => None,
+        _ => None,
     }
 }
 
@@ -165,16 +164,18 @@ mod tests {
     }
 
     #[test]
-    fn curves_are_straight_between_their_points_and_level_beyond() {
+    fn curves_are_straight_between_their_points() {
         let points = vec![(0.0, 0.0), (10.0, 100.0), (20.0, 120.0)];
         let curve = |is_interpolated, default| Conversion::Points {
             points: points.clone(),
             is_interpolated,
             default,
         };
-        for (number, value) in [(-5.0, 0.0), (5.0, 50.0), (10.0, 100.0), (15.0, 110.0), (99.0, 120.0)] {
+        for (number, value) in [(0.0, 0.0), (5.0, 50.0), (10.0, 100.0), (15.0, 110.0), (20.0, 120.0)] {
             assert_eq!(curve(true, None).meaning(number), Meaning::Value(value));
         }
+        assert_eq!(curve(true, None).meaning(20.5), Meaning::Nothing);
+        assert_eq!(curve(true, Some(-1.0)).meaning(-0.5), Meaning::Value(-1.0));
         assert_eq!(curve(true, None).number(110.0), Some(15.0));
         assert_eq!(curve(true, None).number(130.0), None);
         assert_eq!(curve(false, None).meaning(5.0), Meaning::Nothing);

@@ -1,7 +1,5 @@
 //! Reads A2L files with the crate a2lfile.
 
-use std::path::Path;
-
 use a2lfile::{A2lFile, A2lObjectName as _, ByteOrderEnum, CharacteristicType, ConversionType, Module};
 use cantap_trace::clean;
 use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
@@ -12,20 +10,22 @@ use super::if_data::Transport;
 use super::object::{Bits, DataType, Object};
 use crate::calibration::parts::ByteOrder;
 
-/// The largest file that is read, in bytes.
-const MOST_BYTES: u64 = 512 << 20;
+/// The largest file that is read, with what it includes, in bytes.
+const MOST_BYTES: usize = 512 << 20;
 /// How many things that are left out are listed by name.
 const MOST_ISSUES: usize = 1000;
 
+/// How deep files may include each other.
+const DEEPEST: usize = 8;
+/// How many files may be included altogether: those that include each other twice would never end.
+const MOST_INCLUDED: usize = 1000;
+
 /// Why a file cannot be used.
-#[derive(Debug, thiserror::Error)]
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
 pub enum A2lError {
-    /// It cannot be read.
-    #[error("it cannot be read")]
-    Io(#[from] std::io::Error),
-    /// It is too large.
-    #[error("it is larger than 512 MiB")]
+    /// With all that it includes, it is too large.
+    #[error("with what it includes, it is larger than 512 MiB")]
     TooLarge,
     /// It is no A2L.
     #[error("it is no A2L file: {0}")]
@@ -35,23 +35,21 @@ pub enum A2lError {
     Empty,
 }
 
+/// The bytes of a file that is included under this name, if there is one.
+pub type Include<'f> = dyn FnMut(&str) -> Option<Vec<u8>> + 'f;
+
 impl Description {
-    /// Reads a file, and those that it includes. One description for each module.
+    /// Reads a file, and those that it includes. One description for each module. What is missing is left out.
     ///
     /// # Errors
     ///
-    /// It cannot be read, is larger than 512 MiB, or no A2L.
-    pub fn read(path: &Path) -> Result<Vec<Self>, A2lError> {
-        if std::fs::metadata(path)?.len() > MOST_BYTES {
-            return Err(A2lError::TooLarge);
-        }
-        let text = decode(&std::fs::read(path)?);
-        if !includes(&text) {
-            return Self::parse(&text);
-        }
-        match a2lfile::load(path, None, false) {
-            Ok((file, _)) => of_file(&file, &[]),
-            Err(error) => Self::parse_bare(&text, &format!("without what it includes: {error}")),
+    /// It is no A2L, or larger than 512 MiB.
+    pub fn read(bytes: &[u8], include: &mut Include<'_>) -> Result<Vec<Self>, A2lError> {
+        let mut issues = Vec::new();
+        let text = expanded(&decode(bytes), include, (0, &mut 0), &mut issues)?;
+        match a2lfile::load_from_string(&text, None, false) {
+            Ok((file, _)) => of_file(&file, &issues),
+            Err(error) => Self::parse_bare(&text, &format!("without its A2ML: {error}"), issues),
         }
     }
 
@@ -61,26 +59,21 @@ impl Description {
     ///
     /// It is no A2L.
     pub fn parse(text: &str) -> Result<Vec<Self>, A2lError> {
-        if includes(text) {
-            return Self::parse_bare(text, "files that it includes are left out");
-        }
-        match a2lfile::load_from_string(text, None, false) {
-            Ok((file, _)) => of_file(&file, &[]),
-            Err(error) => Self::parse_bare(text, &format!("without its A2ML: {error}")),
-        }
+        Self::read(text.as_bytes(), &mut |_| None)
     }
 
-    /// Without all that is not needed, and more often wrong than the rest: files that are included, the grammar of IF_DATA, the project's name.
-    fn parse_bare(text: &str, issue: &str) -> Result<Vec<Self>, A2lError> {
-        let bare = without_project_name(&without_includes(&without_a2ml(text)));
+    /// Without all that is not needed, and more often wrong than the rest: the grammar of IF_DATA, the project's name.
+    fn parse_bare(text: &str, issue: &str, mut issues: Vec<String>) -> Result<Vec<Self>, A2lError> {
+        let bare = without_project_name(&without_a2ml(text));
+        issues.push(shown(issue));
         let error = match a2lfile::load_from_string(&bare, None, false) {
-            Ok((file, _)) => return of_file(&file, &[shown(issue)]),
+            Ok((file, _)) => return of_file(&file, &issues),
             Err(error) => error,
         };
         if !bare.contains("/begin PROJECT")
             && let Ok(module) = a2lfile::load_fragment(&bare, None)
         {
-            let one = Loader { module: &module, issues: Vec::new() }.load();
+            let one = Loader { module: &module, issues }.load();
             // A file of something else is a fragment without anything in it.
             if !one.objects().is_empty() {
                 return Ok(vec![one]);
@@ -88,11 +81,6 @@ impl Description {
         }
         Err(A2lError::Malformed(shown(&error.to_string())))
     }
-}
-
-/// Whether other files are included.
-fn includes(text: &str) -> bool {
-    text.contains("/include") || text.contains("/INCLUDE")
 }
 
 /// A text of the file, as it can be shown.
@@ -126,20 +114,40 @@ fn without_a2ml(text: &str) -> String {
     out
 }
 
-/// Without directives that include other files.
-fn without_includes(text: &str) -> String {
+/// With the texts of the files that it includes.
+fn expanded(
+    text: &str,
+    include: &mut Include<'_>,
+    (depth, included): (usize, &mut usize),
+    issues: &mut Vec<String>,
+) -> Result<String, A2lError> {
     let (mut out, mut rest) = (String::with_capacity(text.len()), text);
     let next = |rest: &str| [rest.find("/include"), rest.find("/INCLUDE")].into_iter().flatten().min();
     while let Some(at) = next(rest) {
         out.push_str(&rest[..at]);
         let after = rest[at + "/include".len()..].trim_start();
-        rest = match after.strip_prefix('"') {
-            Some(quoted) => quoted.find('"').map_or("", |end| &quoted[end + 1..]),
-            None => after.find(char::is_whitespace).map_or("", |end| &after[end..]),
+        let (name, behind) = match after.strip_prefix('"') {
+            Some(quoted) => quoted.split_once('"').unwrap_or((quoted, "")),
+            None => after.split_at(after.find(char::is_whitespace).unwrap_or(after.len())),
         };
+        rest = behind;
+        *included += 1;
+        let is_one_more = depth < DEEPEST && *included <= MOST_INCLUDED;
+        match is_one_more.then(|| include(name)).flatten() {
+            Some(bytes) => {
+                out.push_str(&expanded(&decode(&bytes), include, (depth + 1, included), issues)?);
+            }
+            None if issues.len() < MOST_ISSUES => {
+                issues.push(shown(&format!("{name}, which it includes, is left out")));
+            }
+            None => {}
+        }
+        if out.len() > MOST_BYTES {
+            return Err(A2lError::TooLarge);
+        }
     }
     out.push_str(rest);
-    out
+    if out.len() > MOST_BYTES { Err(A2lError::TooLarge) } else { Ok(out) }
 }
 
 /// With another name for the project: nobody needs it, and it is where names are that the standard does not allow.

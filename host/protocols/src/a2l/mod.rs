@@ -14,7 +14,7 @@ mod tests;
 pub use conversion::{Conversion, Meaning, Texts};
 pub use description::{Description, Descriptions};
 pub use if_data::{DaqEvent, Transport};
-pub use load::A2lError;
+pub use load::{A2lError, Include};
 pub use object::{Bits, DataType, Object, ValueError};
 
 use crate::Field;

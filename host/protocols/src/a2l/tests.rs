@@ -107,7 +107,16 @@ fn a_wrong_grammar_of_if_data_or_a_missing_file_is_no_obstacle() {
     let including = ECU.replace("/begin MOD_COMMON", "/include \"none.aml\" /begin MOD_COMMON");
     let description = Description::parse(&including).unwrap().remove(0);
     assert_eq!(description.objects().len(), ecu().objects().len());
-    assert!(description.issues[0].contains("includes"), "{:?}", description.issues);
+    assert_eq!(description.issues[0], "none.aml, which it includes, is left out");
+    let (head, module) = ECU.split_once("/begin MEASUREMENT").unwrap();
+    let (measured, tail) = module.split_once("/begin CHARACTERISTIC").unwrap();
+    let measured = format!("/begin MEASUREMENT{measured}");
+    let split = format!("{head} /include \"measured.a2l\" /begin CHARACTERISTIC{tail}");
+    let mut include = |name: &str| (name == "measured.a2l").then(|| measured.clone().into_bytes());
+    let description = Description::read(split.as_bytes(), &mut include).unwrap().remove(0);
+    assert_eq!(description.objects().len(), ecu().objects().len());
+    let endless = Description::read(split.as_bytes(), &mut |_| Some(b"/include again".to_vec()));
+    assert!(endless.is_ok_and(|all| all[0].issues[0].contains("again")));
     let named = ECU.replace("PROJECT Demo", "PROJECT Demo-2");
     assert_eq!(Description::parse(&named).unwrap()[0].objects().len(), ecu().objects().len());
     let (_, module) = ECU.split_once("/begin MODULE Ecu \"\"").unwrap();

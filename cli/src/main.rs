@@ -30,6 +30,7 @@ mod database_args;
 mod exit;
 mod fd_frames;
 mod input;
+mod key_command;
 mod keyboard;
 mod live_args;
 mod one_board;

@@ -31,6 +31,7 @@ use crate::protocols::{self, ProtocolArgs};
                 cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
                 cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
                 cantap conversations workshop.log --odx car.pdx\n  \
+                cantap conversations bench.log --a2l engine.a2l\n  \
                 cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
                 Without --protocol, each channel is read by the protocols that its first frames show, and by others as \
                 soon as they show; they are named on standard error. A line is: time, interface, protocol, sender > \
@@ -47,7 +48,7 @@ pub struct Args {
     live: LiveArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Only this protocol, on every channel: isotp, uds, kwp2000, obd, j1939, nmea2000, canopen or devicenet. Several with commas, or repeated. isotp
+    /// Only this protocol, on every channel: isotp, uds, kwp2000, obd, j1939, nmea2000, canopen, devicenet, xcp or ccp. Several with commas, or repeated. isotp
     /// alone shows transfers as they are.
     #[arg(long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
     protocols: Vec<Protocol>,

@@ -44,7 +44,10 @@ const GROUPS: [(&str, &[&str]); 7] = [
     ),
     (
         "Send, ask",
-        &["send", "replay", "gen", "run", "twin", "obd", "uds", "canopen", "j1939", "gateway", "disturb"],
+        &[
+            "send", "replay", "gen", "run", "twin", "obd", "uds", "xcp", "canopen", "j1939", "gateway",
+            "disturb",
+        ],
     ),
     (
         "Devices",

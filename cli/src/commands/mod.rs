@@ -47,6 +47,7 @@ pub mod ui;
 pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
+pub mod xcp;
 
 use std::process::ExitCode;
 
@@ -93,6 +94,8 @@ pub enum Command {
     Uds(Box<uds::Args>),
     /// Talk to CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
     Canopen(Box<canopen::Args>),
+    /// Measure and calibrate an ECU by XCP or CCP: read, write, poll, record its values, by an A2L file.
+    Xcp(Box<xcp::Args>),
     /// Talk to J1939 nodes: claim an address, request parameter groups and trouble codes, send messages.
     J1939(Box<j1939::Args>),
     /// Explain a command, or a topic: wiring, filters, conditions, times.
@@ -161,6 +164,7 @@ impl Command {
                 | Self::Run(_)
                 | Self::Obd(_)
                 | Self::Uds(_)
+                | Self::Xcp(_)
                 | Self::Canopen(_)
                 | Self::J1939(_)
         )
@@ -188,6 +192,7 @@ impl Command {
             Self::Conversations(args) => conversations::run(&args),
             Self::Obd(args) => obd::run(&args),
             Self::Uds(args) => uds::run(&args),
+            Self::Xcp(args) => xcp::run(&args),
             Self::Canopen(args) => canopen::run(&args),
             Self::J1939(args) => j1939::run(&args),
             Self::Help(args) => help::run(&args, &line),

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cantap_virtual::{Options, canopen, car, open_terminal};
+use cantap_virtual::{Options, canopen, car, ecu, open_terminal};
 
 use cantap_work::interrupt;
 
@@ -16,7 +16,9 @@ use cantap_work::interrupt;
                         seed, settings, pace, ppm and serial\n  \
                         canopen          CANopen nodes on channel 1, one of them without a number;\n                   \
                         --print-eds prints their sheet. It does not go with load,\n                   \
-                        frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
+                        frames, burst and log\n  \
+                        ecu              an ECU with XCP and CCP on channel 1; --print-a2l prints its\n                   \
+                        description. It does not go with load, frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
                         bitrate=RATE     of the bus (default: the rate it is opened at)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
@@ -40,11 +42,14 @@ pub struct Args {
     #[arg(default_value = "")]
     options: Options,
     /// Print the vehicle's database (a DBC file) and exit.
-    #[arg(long, conflicts_with = "print_eds")]
+    #[arg(long, conflicts_with_all = ["print_eds", "print_a2l"])]
     dbc: bool,
     /// Print the sheet of the CANopen nodes (an EDS file) and exit.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "print_a2l")]
     print_eds: bool,
+    /// Print the description of the ECU (an A2L file) and exit.
+    #[arg(long)]
+    print_a2l: bool,
 }
 
 /// Runs it.
@@ -55,6 +60,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     if args.print_eds {
         std::io::stdout().lock().write_all(canopen::SHEET.as_bytes())?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    if args.print_a2l {
+        std::io::stdout().lock().write_all(ecu::DESCRIPTION.as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }
     interrupt::watch()?;

@@ -4,12 +4,15 @@
 mod known;
 mod sheet;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use cantap_protocols::Options;
+use cantap_protocols::calibration::{Known as KnownConnections, MasterSlave};
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
+use cantap_work::a2l;
 use cantap_work::odx::{self, OdxPath};
 use cantap_work::reading::Reading;
 use cantap_work::report::Reporter;
@@ -33,6 +36,15 @@ pub struct ProtocolArgs {
     /// with a layer behind it (car.pdx:Engine_V2), that variant of it. Can be repeated.
     #[arg(long = "odx", value_name = "FILE[:LAYER]")]
     odx: Vec<OdxPath>,
+    /// The description (A2L) of an ECU: names and values of what is measured and calibrated by XCP and CCP. Can be repeated.
+    #[arg(long = "a2l", value_name = "FILE")]
+    a2l: Vec<PathBuf>,
+    /// The identifiers of an XCP master and its slave, as 7F0:7F1, if they were connected before the trace begins. Can be repeated.
+    #[arg(long = "xcp", value_name = "MASTER:SLAVE")]
+    xcp: Vec<MasterSlave>,
+    /// The same for CCP.
+    #[arg(long = "ccp", value_name = "MASTER:SLAVE")]
+    ccp: Vec<MasterSlave>,
 }
 
 fn pair_help() -> String {
@@ -56,7 +68,12 @@ impl ProtocolArgs {
         let descriptions = odx::load(&self.odx, &reporter(quiet))?;
         let mut pairs = self.pairs.clone();
         pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
-        Ok(Options { pairs, sheets, descriptions, ..Options::default() })
+        let calibration = KnownConnections {
+            xcp: self.xcp.clone(),
+            ccp: self.ccp.clone(),
+            descriptions: a2l::load(&self.a2l, &reporter(quiet))?,
+        };
+        Ok(Options { pairs, sheets, descriptions, calibration, ..Options::default() })
     }
 }
 
@@ -68,7 +85,7 @@ fn reporter(quiet: bool) -> Reporter {
 /// [`ProtocolArgs`] mean something with `--protocols` only. For `Command::mut_args` of a command that has it.
 pub fn needs_protocols(arg: Arg) -> Arg {
     match arg.get_id().as_str() {
-        "pairs" | "sheets" | "odx" => arg.requires("protocols"),
+        "pairs" | "sheets" | "odx" | "a2l" | "xcp" | "ccp" => arg.requires("protocols"),
         _ => arg,
     }
 }

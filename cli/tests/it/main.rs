@@ -88,3 +88,4 @@ mod ui;
 mod unsent;
 mod virtual_canopen;
 mod vocabulary;
+mod xcp;

@@ -4,10 +4,12 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use cantap_signals::Decoder;
-use cantap_trace::TraceRecord;
-use rustc_hash::FxHashMap;
+use cantap_trace::{Id, TraceRecord};
+use rustc_hash::{FxHashMap, FxHashSet};
 
+use crate::calibration::Known;
 use crate::canopen::{CanOpen, Sheet};
+use crate::ccp::Ccp;
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, KnownPairs};
@@ -16,7 +18,8 @@ use crate::odx::Descriptions;
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
 use crate::watch::Begun;
-use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
+use crate::xcp::Xcp;
+use crate::{Assembler, Event, Evidence, Party, Protocol, UnderWay};
 
 /// What to decode.
 #[derive(Clone, Debug, Default)]
@@ -31,12 +34,14 @@ pub struct Options {
     pub sheets: Vec<Sheet>,
     /// Descriptions of ECUs for diagnostics.
     pub descriptions: Option<Arc<Descriptions>>,
+    /// Connections of XCP and CCP, and what is at which address.
+    pub calibration: Known,
 }
 
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     /// Those that a channel needs, or has needed.
-    readers: [Option<Box<dyn Assembler + Send + Sync>>; 3],
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
     /// J1939 and NMEA 2000: a channel may have one of them, and the other later.
     family: Option<Box<J1939>>,
     /// The protocols of each channel.
@@ -46,6 +51,8 @@ pub struct Conversations {
     wanted: u16,
     /// Channels that do not, or not yet, have diagnostics.
     doubts: FxHashMap<u8, Doubt>,
+    /// Channels and identifiers of connections of XCP and CCP.
+    calibrated: FxHashSet<(u8, Id)>,
 }
 
 /// What looks like diagnostics on a channel, but may be other traffic.
@@ -63,6 +70,8 @@ const OF_DIAGNOSTICS: u8 = 1;
 const OF_CANOPEN: u8 = 2;
 const OF_DEVICENET: u8 = 4;
 const OF_FAMILY: u8 = 8;
+const OF_XCP: u8 = 16;
+const OF_CCP: u8 = 32;
 
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
@@ -71,6 +80,8 @@ fn readers_of(spoken: u16) -> u8 {
         | has(FAMILY, OF_FAMILY)
         | has(Protocol::CanOpen.bit(), OF_CANOPEN)
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
+        | has(Protocol::Xcp.bit(), OF_XCP)
+        | has(Protocol::Ccp.bit(), OF_CCP)
 }
 
 /// Whose groups a channel with these protocols has.
@@ -92,7 +103,7 @@ impl Conversations {
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
         // Without a survey or a choice, frames that fit two protocols would be decoded twice.
         let everywhere = match (spoken, options.protocols.is_empty()) {
-            (Some(_), _) | (None, true) => Protocol::DIAGNOSTICS & wanted,
+            (Some(_), _) | (None, true) => (Protocol::DIAGNOSTICS | options.calibration.protocols()) & wanted,
             (None, false) => wanted,
         };
         let (mut of_channels, mut doubts) = ([everywhere; 256], FxHashMap::default());
@@ -112,6 +123,7 @@ impl Conversations {
             of_channel: Box::new([0; 256]),
             wanted,
             doubts,
+            calibrated: FxHashSet::default(),
         };
         this.assign(options);
         this
@@ -132,6 +144,7 @@ impl Conversations {
         let before = events.len();
         self.read(record, self.of_channel[usize::from(record.channel)] & !OF_DIAGNOSTICS, events);
         events.extend(said);
+        self.leave_out_calibration(before, events);
         self.hold_back(before, events);
     }
 
@@ -157,7 +170,7 @@ impl Conversations {
             }
         }
         for (number, reader) in self.readers.iter_mut().enumerate() {
-            if needed & 1 << number == 0 || reader.is_some() {
+            if needed & 1 << number & !OF_FAMILY == 0 || reader.is_some() {
                 continue;
             }
             *reader = Some(match 1 << number {
@@ -169,6 +182,8 @@ impl Conversations {
                     Box::new(diagnostics.with_descriptions(options.descriptions.clone()))
                 }
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
+                OF_XCP => Box::new(Xcp::new(options.calibration.clone())),
+                OF_CCP => Box::new(Ccp::new(options.calibration.clone())),
                 _ => Box::new(DeviceNet::new()),
             });
         }
@@ -180,6 +195,7 @@ impl Conversations {
         let before = events.len();
         self.read(record, readers, events);
         if events.len() > before {
+            self.leave_out_calibration(before, events);
             self.keep_wanted(before, events);
             self.hold_back(before, events);
         }
@@ -209,6 +225,7 @@ impl Conversations {
         if let Some(family) = &mut self.family {
             family.finish(events);
         }
+        self.leave_out_calibration(before, events);
         self.keep_wanted(before, events);
         self.hold_back(before, events);
     }
@@ -223,6 +240,31 @@ impl Conversations {
         });
         under_way.sort_by_key(|transfer| transfer.start_ns);
         under_way
+    }
+
+    /// Removes new events of diagnostics about frames of XCP and CCP: their data packets begin with any number, as those of ISO 15765-2 do.
+    fn leave_out_calibration(&mut self, before: usize, events: &mut Vec<Event>) {
+        for event in &events[before..] {
+            if event.protocol.bit() & Protocol::CALIBRATION != 0 {
+                let ids = [event.from, event.to].into_iter().filter_map(|party| match party {
+                    Party::Id(id) => Some((event.channel, id)),
+                    _ => None,
+                });
+                self.calibrated.extend(ids);
+            }
+        }
+        if self.calibrated.is_empty() {
+            return;
+        }
+        for event in events.split_off(before) {
+            let has = |party: Party| match party {
+                Party::Id(id) | Party::Addressed(id, _) => self.calibrated.contains(&(event.channel, id)),
+                _ => false,
+            };
+            if !event.protocol.is_diagnostics() || !(has(event.from) || has(event.to)) {
+                events.push(event);
+            }
+        }
     }
 
     /// Holds back new events of diagnostics on channels where nothing has shown yet that it is them.

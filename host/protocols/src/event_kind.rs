@@ -92,6 +92,8 @@ kinds! {
     DuplicateCheck = "duplicate_check",
     /// Another node has this MAC ID.
     Duplicate = "duplicate",
+    /// An event or a request that a slave reports by itself.
+    Notification = "notification",
     /// A message of a node that is not on line.
     Offline = "offline",
 }

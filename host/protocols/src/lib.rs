@@ -5,9 +5,12 @@
 
 #![forbid(unsafe_code)]
 
+pub mod a2l;
 pub mod active;
 mod assembler;
+pub mod calibration;
 pub mod canopen;
+pub mod ccp;
 mod condition;
 mod conversations;
 pub mod devicenet;
@@ -32,6 +35,7 @@ mod table;
 mod testing;
 mod text;
 mod watch;
+pub mod xcp;
 
 pub use assembler::{Assembler, UnderWay, is_gap};
 pub use condition::condition;

@@ -291,7 +291,13 @@ fn subject(event: &Event) -> Option<Party> {
         // An unanswered request says nothing about a node, and one to all says nothing about any.
         Protocol::J1939 | Protocol::Nmea2000 if event.kind == EventKind::NoResponse => known(event.to),
         Protocol::J1939 | Protocol::Nmea2000 | Protocol::IsoTp => known(event.from),
-        Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd => match event.kind {
+        Protocol::Xcp | Protocol::Ccp
+            if matches!(event.kind, EventKind::Notification | EventKind::Periodic) =>
+        {
+            known(event.from)
+        }
+        Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd | Protocol::Xcp | Protocol::Ccp => match event.kind
+        {
             EventKind::Response => known(event.from),
             EventKind::Exchange | EventKind::Refusal => known(event.to),
             EventKind::NoResponse if matches!(event.trouble, Some(Trouble::Timeout { .. })) => {

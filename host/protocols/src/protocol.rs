@@ -23,11 +23,15 @@ pub enum Protocol {
     CanOpen,
     /// DeviceNet.
     DeviceNet,
+    /// XCP on CAN.
+    Xcp,
+    /// CCP 2.1.
+    Ccp,
 }
 
 impl Protocol {
     /// All of them.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::IsoTp,
         Self::Uds,
         Self::Kwp2000,
@@ -36,6 +40,8 @@ impl Protocol {
         Self::Nmea2000,
         Self::CanOpen,
         Self::DeviceNet,
+        Self::Xcp,
+        Self::Ccp,
     ];
 
     /// Its name in text, JSON and on the command line.
@@ -49,6 +55,8 @@ impl Protocol {
             Self::Nmea2000 => "nmea2000",
             Self::CanOpen => "canopen",
             Self::DeviceNet => "devicenet",
+            Self::Xcp => "xcp",
+            Self::Ccp => "ccp",
         }
     }
 
@@ -60,6 +68,9 @@ impl Protocol {
     /// The set of those.
     pub(crate) const DIAGNOSTICS: u16 =
         Self::IsoTp.bit() | Self::Uds.bit() | Self::Kwp2000.bit() | Self::Obd.bit();
+
+    /// XCP and CCP.
+    pub(crate) const CALIBRATION: u16 = Self::Xcp.bit() | Self::Ccp.bit();
 
     /// Its bit in a set.
     pub(crate) const fn bit(self) -> u16 {
@@ -99,7 +110,7 @@ mod tests {
     /// length.
     #[test]
     fn every_protocol_can_be_named() {
-        assert_eq!(Protocol::ALL.len(), Protocol::DeviceNet as usize + 1);
+        assert_eq!(Protocol::ALL.len(), Protocol::Ccp as usize + 1);
         for (number, protocol) in Protocol::ALL.into_iter().enumerate() {
             assert_eq!(protocol as usize, number);
             assert_eq!(protocol.name().parse(), Ok(protocol));

@@ -2,10 +2,13 @@
 
 use cantap_trace::{TraceFrame, TraceRecord};
 
+use crate::calibration::finding::ConnectionSigns;
 use crate::canopen::CanOpenSigns;
+use crate::ccp::signs::SessionFinder;
 use crate::devicenet::DeviceNetSigns;
 use crate::j1939::{self, Header};
-use crate::{Protocol, nmea2000};
+use crate::xcp::signs::ConnectFinder;
+use crate::{Event, Party, Protocol, nmea2000};
 
 /// Counts on one channel.
 #[derive(Clone, Debug, Default)]
@@ -13,6 +16,8 @@ pub(crate) struct Signs {
     pub extended: ExtendedSigns,
     pub canopen: CanOpenSigns,
     pub devicenet: DeviceNetSigns,
+    pub xcp: ConnectionSigns<ConnectFinder>,
+    pub ccp: ConnectionSigns<SessionFinder>,
 }
 
 /// Numbers of data frames with 29 bits.
@@ -46,12 +51,36 @@ impl Signs {
         if wanted & Protocol::DeviceNet.bit() != 0 && self.devicenet.take(record.time_ns, frame) {
             of |= Protocol::DeviceNet.bit();
         }
+        if wanted & Protocol::CALIBRATION != 0 && !frame.is_remote() {
+            of |= self.take_calibration(record, frame, wanted);
+        }
         of
+    }
+
+    fn take_calibration(&mut self, record: &TraceRecord, frame: &TraceFrame, wanted: u16) -> u16 {
+        let (id, data) = (frame.id(), frame.data());
+        let mut of = 0;
+        if wanted & Protocol::Xcp.bit() != 0 && self.xcp.take(record, id, data) {
+            of |= Protocol::Xcp.bit();
+        }
+        if wanted & Protocol::Ccp.bit() != 0 && self.ccp.take(record, id, data) {
+            of |= Protocol::Ccp.bit();
+        }
+        of
+    }
+
+    /// Whether an event is about the frames of a connection of XCP or CCP, which may look like transfers of ISO 15765-2.
+    pub fn is_calibration(&self, event: &Event) -> bool {
+        let has = |party: Party| match party {
+            Party::Id(id) | Party::Addressed(id, _) => self.xcp.has(id) || self.ccp.has(id),
+            _ => false,
+        };
+        has(event.from) || has(event.to)
     }
 
     /// Forgets the counts of what other traffic contradicts, and of what there was nothing of; returns whether any are left.
     pub fn keep_plausible(&mut self) -> bool {
-        let Self { extended, canopen, devicenet } = self;
+        let Self { extended, canopen, devicenet, xcp, ccp } = self;
         let known = extended.marine + extended.vehicle;
         if known == 0 || known <= extended.all / 10 {
             *extended = ExtendedSigns::default();
@@ -62,7 +91,7 @@ impl Signs {
         if devicenet.count() == 0 {
             *devicenet = DeviceNetSigns::default();
         }
-        extended.all > 0 || canopen.count() > 0 || devicenet.count() > 0
+        extended.all > 0 || canopen.count() > 0 || devicenet.count() > 0 || xcp.count() + ccp.count() > 0
     }
 
     /// The protocols, with the number of messages that indicate them. Some are known already.
@@ -80,6 +109,8 @@ impl Signs {
             (Protocol::Nmea2000, marine),
             (Protocol::CanOpen, canopen),
             (Protocol::DeviceNet, devicenet),
+            (Protocol::Xcp, self.xcp.count()),
+            (Protocol::Ccp, self.ccp.count()),
         ]
         .into_iter()
         .filter(move |(protocol, count)| *count > 0 && known & protocol.bit() == 0)

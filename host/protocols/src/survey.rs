@@ -96,6 +96,9 @@ impl Survey {
             relatives.take(frame);
         }
         for event in self.events.drain(..) {
+            if self.channels.get(&event.channel).is_some_and(|(signs, _)| signs.is_calibration(&event)) {
+                continue;
+            }
             self.diagnostics_signs.entry(event.channel).or_default().take(&event);
             self.said.push((self.records, event));
         }

@@ -19,6 +19,8 @@ pub mod canopen;
 pub mod car;
 mod check;
 mod controller;
+#[cfg(feature = "nodes")]
+pub mod ecu;
 mod edges;
 mod flash;
 #[cfg(feature = "nodes")]

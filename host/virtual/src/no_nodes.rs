@@ -24,3 +24,8 @@ pub const fn car(_: usize, _: u64) -> Schedule {
 pub const fn canopen(_: usize) -> Schedule {
     Schedule::Silent
 }
+
+/// There is no ECU.
+pub const fn ecu(_: usize) -> Schedule {
+    Schedule::Silent
+}

@@ -2,6 +2,7 @@
 
 use crate::canopen::CanOpenBus;
 use crate::car::{self, CarBus};
+use crate::ecu::EcuBus;
 use crate::simbus::Schedule;
 
 /// Why this build has none.
@@ -25,4 +26,9 @@ pub fn car(channel: usize, seed: u64) -> Schedule {
 /// What the CANopen nodes send on a channel's bus: they are on the first.
 pub fn canopen(channel: usize) -> Schedule {
     if channel == 0 { Schedule::Nodes(Box::new(CanOpenBus::in_use())) } else { Schedule::Silent }
+}
+
+/// What the ECU that is measured and calibrated sends on a channel's bus: it is on the first.
+pub fn ecu(channel: usize) -> Schedule {
+    if channel == 0 { Schedule::Nodes(Box::new(EcuBus::in_use())) } else { Schedule::Silent }
 }

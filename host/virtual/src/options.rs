@@ -18,7 +18,7 @@ const MAX_SERIAL_BYTES: usize = 24;
 
 /// Options that a car on the bus excludes.
 const MADE_UP: [&str; 5] = ["load", "frames", "bitrate", "burst", "wire"];
-/// Options that CANopen nodes exclude; they work at any bit rate.
+/// Options that CANopen nodes and the ECU exclude; they work at any bit rate.
 const MADE_UP_FRAMES: [&str; 3] = ["load", "frames", "burst"];
 
 /// How model time passes.
@@ -34,7 +34,7 @@ pub enum Pace {
 /// The simulated buses, their traffic, and the pace.
 ///
 /// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `canopen` (CANopen
-/// nodes on the first bus: see [`crate::canopen`]), `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `bitrate` (by default that
+/// nodes on the first bus: see [`crate::canopen`]), `ecu` (an ECU with XCP and CCP on the first bus: see [`crate::ecu`]), `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `bitrate` (by default that
 /// with which the channel is opened), `burst` (`10/960us`: frames in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb`
 /// (the number of frames destroyed on each bus, the first ones that the device sends), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps
 /// what the device saves), `serial` (its serial number), `ppm` (how much too fast its crystal is, in parts per million), `pace` (`real`, `fast`),
@@ -75,6 +75,8 @@ pub struct Options {
     pub car: bool,
     /// CANopen nodes on the first bus: see [`crate::canopen`].
     pub canopen: bool,
+    /// An ECU that is measured and calibrated, on the first bus: see [`crate::ecu`].
+    pub ecu: bool,
     /// Frames to replay at their own times (nanoseconds since the start) instead of made-up ones, per channel.
     pub log: Option<[Vec<(u64, Frame)>; CHANNELS]>,
 }
@@ -98,6 +100,7 @@ impl Default for Options {
             serial: "VIRTUAL".to_owned(),
             car: false,
             canopen: false,
+            ecu: false,
             log: None,
         }
     }
@@ -109,7 +112,7 @@ impl Default for Options {
 pub enum BadOption {
     /// There is no such key.
     #[error(
-        "there is no option '{0}'; there are car, canopen, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
+        "there is no option '{0}'; there are car, canopen, ecu, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
     )]
     Unknown(String),
     /// The value is invalid.
@@ -144,17 +147,23 @@ impl FromStr for Options {
             options.set(key, value)?;
             given.push((key, option));
         }
-        let (key, excluded, reason) = match (options.car, options.canopen) {
-            (false, false) => return Ok(options),
-            (true, _) => {
+        let (key, excluded, reason) = match (options.car, options.canopen, options.ecu) {
+            (false, false, false) => return Ok(options),
+            (true, ..) => {
                 ("car", &MADE_UP[..], "the car has its own traffic and bit rates; leave out one of the two")
             }
-            (false, true) => {
+            (false, true, _) => {
                 ("canopen", &MADE_UP_FRAMES[..], "the nodes have their own traffic; leave out one of the two")
             }
+            (false, false, true) => {
+                ("ecu", &MADE_UP_FRAMES[..], "the ECU has its own traffic; leave out one of the two")
+            }
         };
-        let wrong =
-            given.iter().rfind(|(other, _)| excluded.contains(other) || key == "car" && *other == "canopen");
+        // Of these, only one.
+        let nodes = ["car", "canopen", "ecu"];
+        let wrong = given
+            .iter()
+            .rfind(|(other, _)| excluded.contains(other) || *other != key && nodes.contains(other));
         let wrong = wrong.map(|(_, option)| *option).or(options.log.is_some().then_some("log"));
         match wrong {
             None => Ok(options),
@@ -181,12 +190,16 @@ impl Options {
                 .ok_or_else(|| bad(&"give per cent, 0 to 100"))
         };
         match key {
-            "car" | "canopen" if !value.is_empty() => return Err(bad(&"it stands alone")),
-            "car" | "canopen" => {
+            "car" | "canopen" | "ecu" if !value.is_empty() => return Err(bad(&"it stands alone")),
+            "car" | "canopen" | "ecu" => {
                 if let Some(reason) = nodes::MISSING {
                     return Err(bad(&reason));
                 }
-                *(if key == "car" { &mut self.car } else { &mut self.canopen }) = true;
+                match key {
+                    "car" => self.car = true,
+                    "canopen" => self.canopen = true,
+                    _ => self.ecu = true,
+                }
             }
             "load" => self.load_percent = percent()?,
             "errors" => self.error_percent = percent()?,
@@ -250,6 +263,7 @@ impl Options {
             _ if !self.traffic_on[channel] => Schedule::Silent,
             _ if self.car => nodes::car(channel, self.seed),
             _ if self.canopen => nodes::canopen(channel),
+            _ if self.ecu => nodes::ecu(channel),
             (Some(entries), _) => Schedule::Log { entries: entries.into_iter() },
             (None, Some((length, period))) => {
                 Schedule::Bursts { source: self.source(channel), length, period_ns: period.as_nanos() as u64 }

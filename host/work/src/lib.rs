@@ -7,7 +7,7 @@
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
-//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`odx`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
+//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`calibration`], [`odx`], [`a2l`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
 //! | [`obd`] | a vehicle's parameters: who has which, asked again and again, as a table |
 //! | [`changing`], [`disturbance`] | messages whose values change with time; error frames on purpose |
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
@@ -18,6 +18,8 @@
 
 #![forbid(unsafe_code)]
 
+#[cfg(feature = "buses")]
+pub mod a2l;
 #[cfg(feature = "buses")]
 pub mod advice;
 #[cfg(feature = "buses")]
@@ -33,6 +35,8 @@ pub mod bus_hints;
 pub mod bus_off;
 #[cfg(feature = "buses")]
 pub mod cache;
+#[cfg(feature = "buses")]
+pub mod calibration;
 #[cfg(feature = "buses")]
 pub mod changing;
 #[cfg(feature = "buses")]

@@ -1,9 +1,12 @@
-//! The active half: clients for ISO-TP and diagnostics, CANopen and J1939.
+//! The active half: clients for ISO-TP and diagnostics, CANopen, J1939, XCP and CCP.
 //!
 //! Each is a [`Machine`] without its own input and output: frames and the time go in, frames and the next deadline come out. Whoever
 //! has a bus drives it; the `cantap` command does so with a device. Every machine ends in bounded time, whatever the other side does.
 
 mod answer;
+pub mod calibration;
+#[cfg(test)]
+mod calibration_tests;
 pub mod exchange;
 pub mod lss;
 pub mod node_scan;

@@ -40,7 +40,7 @@ pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
             let numbers = [Some(bits("class")?), Some(bits("instance")?), bits("attribute")];
             Some(ObjectKey::Numbered("class", numbers))
         }
-        Protocol::IsoTp => None,
+        Protocol::IsoTp | Protocol::Xcp | Protocol::Ccp => None,
     }
 }
 
@@ -75,7 +75,7 @@ pub(super) fn name_of(event: &Event) -> Option<String> {
         Protocol::CanOpen => meaning("index"),
         Protocol::J1939 | Protocol::Nmea2000 => Some(event.title.to_string()),
         Protocol::DeviceNet => meaning("class"),
-        Protocol::Kwp2000 | Protocol::IsoTp => None,
+        Protocol::Kwp2000 | Protocol::IsoTp | Protocol::Xcp | Protocol::Ccp => None,
     }
 }
 

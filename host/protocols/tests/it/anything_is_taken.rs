@@ -165,6 +165,32 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
             _ => (Id::standard_truncated(request), vec![0; 8]),
         }
     }),
+    // Blocks that are never whole, of ever more masters.
+    ("XCP blocks", &[Protocol::Xcp], |at| {
+        let (master, place) = (0x100 + at / 8 % 0x300 * 2, at % 8);
+        match place {
+            0 => (Id::standard_truncated(master), vec![0xFF, 0]),
+            1 => (Id::standard_truncated(master + 1), vec![0xFF, 5, 0xC0, 8, 8, 0, 1, 1]),
+            2 => (Id::standard_truncated(master), vec![0xF5, 255]),
+            _ => (Id::standard_truncated(master + 1), vec![0xFF, 1, 2, 3, 4, 5, 6, 7]),
+        }
+    }),
+    // Lists that grow.
+    ("XCP lists", &[Protocol::Xcp], |at| {
+        let number = (at / 6) as u16;
+        let [low, high] = number.to_le_bytes();
+        match at % 6 {
+            _ if at == 0 => (Id::standard_truncated(0x7F0), vec![0xFF, 0]),
+            _ if at == 1 => (Id::standard_truncated(0x7F1), vec![0xFF, 5, 0xC0, 8, 8, 0, 1, 1]),
+            0 => (Id::standard_truncated(0x7F0), vec![0xE2, 0, low, high, number as u8, number as u8]),
+            2 => (Id::standard_truncated(0x7F0), vec![0xE1, 0xFF, 4, 0, 0, 0, 0, 0x20]),
+            4 => (Id::standard_truncated(0x7F0), vec![0xD4, 0, low, high, 251]),
+            _ => (Id::standard_truncated(0x7F1), vec![0xFF]),
+        }
+    }),
+    ("CCP commands", &[Protocol::Ccp], |at| {
+        (Id::standard_truncated(0x100 + at / 64 % 0x700), vec![1, at as u8, 0, 0, 0, 0, 0, 0])
+    }),
     // The first fragment and those in the middle, without a last one.
     ("DeviceNet fragments", &[Protocol::DeviceNet], |at| {
         let (node, count) = (at / 64 % 64, (at % 64) as u8);

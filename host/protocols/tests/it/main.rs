@@ -1,5 +1,6 @@
 //! Every integration test of this crate, in one program: each program is linked on its own.
 
+mod a2l_agrees_with_pya2l;
 mod anything_is_taken;
 mod cdd_agrees_with_cantools;
 mod odx_agrees_with_odxtools;

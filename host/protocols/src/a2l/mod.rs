@@ -1,0 +1,41 @@
+//! Descriptions of what is in an ECU's memory: A2L files (ASAM MCD-2 MC, versions 1.31 to 1.71).
+//!
+//! Read are measured values (MEASUREMENT) and parameters (CHARACTERISTIC: values, blocks of values, text) with their conversions, and, of
+//! IF_DATA, the identifiers and events of XCP and CCP. Formulas, curves, maps and the structures of version 1.7 are left out, and listed.
+
+mod conversion;
+mod description;
+mod if_data;
+mod load;
+mod object;
+#[cfg(test)]
+mod tests;
+
+pub use conversion::{Conversion, Meaning, Texts};
+pub use description::{Description, Descriptions};
+pub use if_data::{DaqEvent, Transport};
+pub use load::{A2lError, Include};
+pub use object::{Bits, DataType, Object, ValueError};
+
+use crate::Field;
+use crate::calibration::lists::Entry;
+use crate::calibration::parts::ByteOrder;
+
+/// Appends what an entry of a list contains: the description's values, or its bytes under its address.
+pub(crate) fn push_entry(
+    fields: &mut Vec<Field>,
+    description: Option<&Description>,
+    entry: Entry,
+    bytes: &[u8],
+    order: Option<ByteOrder>,
+) {
+    let Entry { extension, address, bit, .. } = entry;
+    let named = description.filter(|_| bit.is_none());
+    let named = named.map(|description| description.entry_fields(extension, address, bytes, order));
+    match (named.filter(|named| !named.is_empty()), bit, extension) {
+        (Some(named), ..) => fields.extend(named),
+        (None, Some(bit), _) => fields.push(Field::bytes(format!("{address:08X}.{bit}"), bytes)),
+        (None, None, 0) => fields.push(Field::bytes(format!("{address:08X}"), bytes)),
+        (None, None, _) => fields.push(Field::bytes(format!("{extension:02X}:{address:08X}"), bytes)),
+    }
+}

@@ -20,6 +20,7 @@ pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Con
         pairs: options.pairs.clone(),
         sheets: options.sheets.clone(),
         descriptions: options.descriptions.clone(),
+        types: options.types.clone(),
     };
     let listener = Watcher { options, conversations: None, events: Vec::new() };
     Condition::with_listener(text, decoder, Box::new(listener))

@@ -10,11 +10,13 @@ use rustc_hash::FxHashMap;
 use crate::canopen::{CanOpen, Sheet};
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
+use crate::dsdl::{DataTypes, Generation};
 use crate::iso_tp::{IsoTp, KnownPairs};
 use crate::j1939::{Groups, J1939};
 use crate::odx::Descriptions;
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
+use crate::uavcan::Uavcan;
 use crate::watch::Begun;
 use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
@@ -31,12 +33,14 @@ pub struct Options {
     pub sheets: Vec<Sheet>,
     /// Descriptions of ECUs for diagnostics.
     pub descriptions: Option<Arc<Descriptions>>,
+    /// Data types of DroneCAN and Cyphal; without them, those that are built in.
+    pub types: Option<Arc<DataTypes>>,
 }
 
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     /// Those that a channel needs, or has needed.
-    readers: [Option<Box<dyn Assembler + Send + Sync>>; 3],
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
     /// J1939 and NMEA 2000: a channel may have one of them, and the other later.
     family: Option<Box<J1939>>,
     /// The protocols of each channel.
@@ -63,6 +67,8 @@ const OF_DIAGNOSTICS: u8 = 1;
 const OF_CANOPEN: u8 = 2;
 const OF_DEVICENET: u8 = 4;
 const OF_FAMILY: u8 = 8;
+const OF_DRONECAN: u8 = 16;
+const OF_CYPHAL: u8 = 32;
 
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
@@ -71,6 +77,8 @@ fn readers_of(spoken: u16) -> u8 {
         | has(FAMILY, OF_FAMILY)
         | has(Protocol::CanOpen.bit(), OF_CANOPEN)
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
+        | has(Protocol::DroneCan.bit(), OF_DRONECAN)
+        | has(Protocol::Cyphal.bit(), OF_CYPHAL)
 }
 
 /// Whose groups a channel with these protocols has.
@@ -157,7 +165,7 @@ impl Conversations {
             }
         }
         for (number, reader) in self.readers.iter_mut().enumerate() {
-            if needed & 1 << number == 0 || reader.is_some() {
+            if needed & !OF_FAMILY & 1 << number == 0 || reader.is_some() {
                 continue;
             }
             *reader = Some(match 1 << number {
@@ -169,6 +177,12 @@ impl Conversations {
                     Box::new(diagnostics.with_descriptions(options.descriptions.clone()))
                 }
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
+                of @ (OF_DRONECAN | OF_CYPHAL) => {
+                    let types = options.types.clone().unwrap_or_else(DataTypes::built_in);
+                    let is_cyphal = of == OF_CYPHAL;
+                    let generation = if is_cyphal { Generation::Cyphal } else { Generation::DroneCan };
+                    Box::new(Uavcan::new(generation, types))
+                }
                 _ => Box::new(DeviceNet::new()),
             });
         }

@@ -12,6 +12,7 @@ mod condition;
 mod conversations;
 pub mod devicenet;
 pub mod diagnostics;
+pub mod dsdl;
 mod event;
 mod event_kind;
 pub mod iso_tp;
@@ -31,6 +32,7 @@ mod table;
 #[cfg(test)]
 mod testing;
 mod text;
+mod uavcan;
 mod watch;
 
 pub use assembler::{Assembler, UnderWay, is_gap};

@@ -23,11 +23,15 @@ pub enum Protocol {
     CanOpen,
     /// DeviceNet.
     DeviceNet,
+    /// DroneCAN, which was UAVCAN v0.
+    DroneCan,
+    /// Cyphal on CAN, which was UAVCAN v1.
+    Cyphal,
 }
 
 impl Protocol {
     /// All of them.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 10] = [
         Self::IsoTp,
         Self::Uds,
         Self::Kwp2000,
@@ -36,6 +40,8 @@ impl Protocol {
         Self::Nmea2000,
         Self::CanOpen,
         Self::DeviceNet,
+        Self::DroneCan,
+        Self::Cyphal,
     ];
 
     /// Its name in text, JSON and on the command line.
@@ -49,6 +55,8 @@ impl Protocol {
             Self::Nmea2000 => "nmea2000",
             Self::CanOpen => "canopen",
             Self::DeviceNet => "devicenet",
+            Self::DroneCan => "dronecan",
+            Self::Cyphal => "cyphal",
         }
     }
 
@@ -99,7 +107,7 @@ mod tests {
     /// length.
     #[test]
     fn every_protocol_can_be_named() {
-        assert_eq!(Protocol::ALL.len(), Protocol::DeviceNet as usize + 1);
+        assert_eq!(Protocol::ALL.len(), Protocol::Cyphal as usize + 1);
         for (number, protocol) in Protocol::ALL.into_iter().enumerate() {
             assert_eq!(protocol as usize, number);
             assert_eq!(protocol.name().parse(), Ok(protocol));

@@ -4,12 +4,14 @@
 mod known;
 mod sheet;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use cantap_protocols::Options;
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
+use cantap_work::dsdl::{self, SubjectType};
 use cantap_work::odx::{self, OdxPath};
 use cantap_work::reading::Reading;
 use cantap_work::report::Reporter;
@@ -33,6 +35,14 @@ pub struct ProtocolArgs {
     /// with a layer behind it (car.pdx:Engine_V2), that variant of it. Can be repeated.
     #[arg(long = "odx", value_name = "FILE[:LAYER]")]
     odx: Vec<OdxPath>,
+    /// A folder with data types of DroneCAN or Cyphal (DSDL), in addition to the public ones: the one in which the outermost namespaces are. Can be
+    /// repeated.
+    #[arg(long = "dsdl", value_name = "FOLDER")]
+    dsdl: Vec<PathBuf>,
+    /// The data type of a subject of Cyphal, as 1620=uavcan.si.sample.voltage.Scalar.1.0. Can be repeated. Others are those that nodes name in their
+    /// registers, or bytes.
+    #[arg(long = "subject", value_name = "NUMBER=TYPE")]
+    subjects: Vec<SubjectType>,
 }
 
 fn pair_help() -> String {
@@ -56,7 +66,8 @@ impl ProtocolArgs {
         let descriptions = odx::load(&self.odx, &reporter(quiet))?;
         let mut pairs = self.pairs.clone();
         pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
-        Ok(Options { pairs, sheets, descriptions, ..Options::default() })
+        let types = dsdl::load(&self.dsdl, &self.subjects, &reporter(quiet))?;
+        Ok(Options { pairs, sheets, descriptions, types, ..Options::default() })
     }
 }
 
@@ -68,7 +79,7 @@ fn reporter(quiet: bool) -> Reporter {
 /// [`ProtocolArgs`] mean something with `--protocols` only. For `Command::mut_args` of a command that has it.
 pub fn needs_protocols(arg: Arg) -> Arg {
     match arg.get_id().as_str() {
-        "pairs" | "sheets" | "odx" => arg.requires("protocols"),
+        "pairs" | "sheets" | "odx" | "dsdl" | "subjects" => arg.requires("protocols"),
         _ => arg,
     }
 }

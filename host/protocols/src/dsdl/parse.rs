@@ -1,14 +1,6 @@
 //! The text of one definition, as far as it can be understood without the others.
 
-use std::io;
-use std::path::Path;
-
 use super::model::Generation;
-
-/// How many files of definitions a folder may have.
-const MOST_FILES: usize = 20_000;
-/// How long one may be, in bytes.
-const MOST_BYTES: u64 = 1 << 20;
 
 /// A file of definitions.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -68,47 +60,33 @@ pub struct RawArray {
     pub capacity: String,
 }
 
+impl RawArray {
+    /// What stands in brackets.
+    fn of(size: &str) -> Self {
+        let below = size.strip_prefix('<');
+        let up_to = below.and_then(|size| size.strip_prefix('='));
+        let capacity = up_to.or(below).unwrap_or(size).trim().to_owned();
+        Self { is_variable: below.is_some(), is_below: below.is_some() && up_to.is_none(), capacity }
+    }
+}
+
 impl Source {
-    /// All definitions in a folder and the folders in it, which are the outermost namespaces, in the order of their paths. Links are not followed.
-    ///
-    /// # Errors
-    ///
-    /// Whatever keeps a folder or a definition from being read; too many or too long ones.
-    pub fn read_folder(folder: &Path) -> io::Result<Vec<Self>> {
-        let (mut sources, mut folders) = (Vec::new(), vec![(folder.to_owned(), String::new())]);
-        while let Some((folder, namespace)) = folders.pop() {
-            for entry in std::fs::read_dir(&folder)? {
-                let entry = entry?;
-                let Ok(name) = entry.file_name().into_string() else { continue };
-                let kind = entry.file_type()?;
-                let path = format!("{namespace}{name}");
-                if kind.is_dir() && !name.starts_with('.') {
-                    folders.push((entry.path(), format!("{path}/")));
-                    continue;
-                }
-                let source = Self { path, text: String::new() };
-                if !kind.is_file() || source.generation().is_none() {
-                    continue;
-                }
-                if sources.len() == MOST_FILES || entry.metadata()?.len() > MOST_BYTES {
-                    let what = format!("{}: too many or too long definitions", entry.path().display());
-                    return Err(io::Error::other(what));
-                }
-                let bytes = std::fs::read(entry.path())?;
-                sources.push(Self { text: String::from_utf8_lossy(&bytes).into_owned(), ..source });
-            }
-        }
-        sources.sort_by(|a, b| a.path.cmp(&b.path));
-        Ok(sources)
+    /// Whether the name of a file is that of a definition.
+    pub fn has_name(name: &str) -> bool {
+        generation_of(name).is_some()
     }
 
     /// Which language its name is of.
     pub(crate) fn generation(&self) -> Option<Generation> {
-        match self.path.rsplit_once('.')?.1 {
-            "uavcan" => Some(Generation::DroneCan),
-            "dsdl" => Some(Generation::Cyphal),
-            _ => None,
-        }
+        generation_of(&self.path)
+    }
+}
+
+fn generation_of(path: &str) -> Option<Generation> {
+    match path.rsplit_once('.')?.1 {
+        "uavcan" => Some(Generation::DroneCan),
+        "dsdl" => Some(Generation::Cyphal),
+        _ => None,
     }
 }
 
@@ -196,23 +174,12 @@ fn attribute(code: &str, comment: &str, line: usize, section: &mut RawSection) -
         .or_else(|| declared.strip_prefix("saturated "))
         .unwrap_or(declared)
         .trim();
-    let (kind, array, name) = match declared.split_once('[') {
-        Some((kind, rest)) => {
-            let (size, name) = rest.split_once(']')?;
-            let below = size.trim().strip_prefix('<');
-            let up_to = below.and_then(|size| size.strip_prefix('='));
-            let capacity = up_to.or(below).unwrap_or(size).trim().to_owned();
-            let array = RawArray {
-                is_variable: below.is_some(),
-                is_below: below.is_some() && up_to.is_none(),
-                capacity,
-            };
-            (kind, Some(array), name)
-        }
-        None => {
-            let (kind, name) = declared.split_once(char::is_whitespace).unwrap_or((declared, ""));
-            (kind, None, name)
-        }
+    let (kind, array, name) = if let Some((kind, rest)) = declared.split_once('[') {
+        let (size, name) = rest.split_once(']')?;
+        (kind, Some(RawArray::of(size.trim())), name)
+    } else {
+        let (kind, name) = declared.split_once(char::is_whitespace).unwrap_or((declared, ""));
+        (kind, None, name)
     };
     let (kind, name) = (kind.trim(), name.trim());
     let is_name = |name: &str| {

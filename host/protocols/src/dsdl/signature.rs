@@ -22,7 +22,7 @@ impl Signature {
             self.0 ^= u64::from(*byte) << 56;
             for _ in 0..8 {
                 let carry = self.0 >> 63;
-                self.0 = self.0 << 1 ^ carry * 0x42F0_E1EB_A9EA_3693;
+                self.0 = (self.0 << 1) ^ (carry * 0x42F0_E1EB_A9EA_3693);
             }
         }
         self
@@ -40,7 +40,7 @@ pub(crate) fn crc16(from: u16, bytes: &[u8]) -> u16 {
         crc ^= u16::from(*byte) << 8;
         for _ in 0..8 {
             let carry = crc >> 15;
-            crc = crc << 1 ^ carry * 0x1021;
+            crc = (crc << 1) ^ (carry * 0x1021);
         }
         crc
     })

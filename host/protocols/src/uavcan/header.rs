@@ -88,12 +88,12 @@ impl Header {
     }
 
     /// The sender.
-    pub fn from(&self) -> Party {
+    pub fn from(self) -> Party {
         self.source.map_or(Party::Unknown, Party::Node)
     }
 
     /// The receiver.
-    pub fn to(&self) -> Party {
+    pub fn to(self) -> Party {
         self.destination.map_or(Party::Everyone, Party::Node)
     }
 }

@@ -13,6 +13,8 @@ use crate::dsdl::{DataTypes, Generation, crc16};
 const MOST_IDS: usize = 2048;
 /// The most bytes that are kept of a transfer.
 const MOST_BYTES: usize = 512;
+/// So many frames that do not follow show that it is other traffic.
+const MOST_BREAKS: u32 = 64;
 /// So often must the number of transfers have begun anew behind 31, where there is neither a node's report nor a CRC: other bytes that count go on.
 const ENOUGH_WRAPS: u32 = 2;
 
@@ -50,75 +52,70 @@ impl UavcanSigns {
     /// Takes a data frame with 29 bits; returns the protocols whose frame it is.
     pub fn take(&mut self, frame: &TraceFrame) -> u16 {
         self.all += 1;
+        if self.is_hopeless() {
+            return 0;
+        }
         let Some((tail, payload)) = Tail::of(frame.data()) else { return 0 };
         let id = frame.id();
-        let before = self.ids.get(&id.raw());
-        let generation = match (tail.starts, before) {
+        let room = self.ids.len() < MOST_IDS;
+        let before = self.ids.get_mut(&id.raw());
+        let generation = match (tail.starts, &before) {
             (true, _) => tail.generation(),
             (false, Some(before)) => before.generation,
             (false, None) => return 0,
         };
         let Some(header) = Header::of(id, generation) else { return 0 };
-        let follows = before.map(|before| {
-            let is_next = tail.starts
-                && before.tail.ends
-                && before.generation == generation
-                && tail.transfer == (before.tail.transfer + 1) % 32;
-            let goes_on = !tail.starts
-                && !before.tail.ends
-                && tail.transfer == before.tail.transfer
-                && tail.toggle != before.tail.toggle;
-            is_next || goes_on
-        });
         let counts = match generation {
             Generation::DroneCan => &mut self.dronecan,
             Generation::Cyphal => &mut self.cyphal,
         };
-        let is_status = header.purpose == Purpose::Message
-            && header.port == status_port(generation)
-            && header.source.is_some()
-            && tail.starts
-            && tail.ends
-            && payload.len() == 7;
-        let uptime_s = match (is_status, payload) {
-            (true, [a, b, c, d, ..]) => u32::from_le_bytes([*a, *b, *c, *d]),
-            _ => 0,
-        };
-        match follows {
-            Some(true) => {
-                counts.follows += 1;
-                counts.wraps += u32::from(tail.starts && tail.transfer == 0);
+        let uptime_s = uptime(generation, header, tail, payload);
+        let Some(before) = before else {
+            if room {
+                let payload = if tail.ends { Vec::new() } else { payload.to_vec() };
+                let uptime_s = uptime_s.unwrap_or_default();
+                self.ids.insert(id.raw(), Followed { tail, generation, uptime_s, payload });
             }
-            Some(false) => counts.breaks += 1,
-            None => {}
-        }
-        if follows == Some(true) && is_status {
-            let since = before.map_or(0, |before| uptime_s.wrapping_sub(before.uptime_s));
-            counts.proofs += u32::from((0..=3).contains(&since));
-        }
-        let mut held = if tail.starts {
-            Vec::new()
-        } else {
-            self.ids.get_mut(&id.raw()).map_or_else(Vec::new, |before| std::mem::take(&mut before.payload))
+            return protocol(generation).bit();
         };
-        let is_long = !(tail.starts && tail.ends);
-        if is_long && follows != Some(false) && held.len() + payload.len() <= MOST_BYTES {
-            held.extend_from_slice(payload);
+        let follows = before.is_followed_by(tail, generation);
+        if follows {
+            counts.follows += 1;
+            counts.wraps += u32::from(tail.starts && tail.transfer == 0);
         } else {
-            held.clear();
+            counts.breaks += 1;
         }
-        if tail.ends && !tail.starts && follows == Some(true) && is_whole(generation, header, &held) {
-            counts.proofs += 1;
+        if let Some(uptime_s) = uptime_s {
+            let is_next = follows && (0..=3).contains(&uptime_s.wrapping_sub(before.uptime_s));
+            counts.proofs += u32::from(is_next);
+            before.uptime_s = uptime_s;
         }
-        if self.ids.len() < MOST_IDS || self.ids.contains_key(&id.raw()) {
-            self.ids.insert(id.raw(), Followed { tail, generation, uptime_s, payload: held });
+        if tail.starts || !follows {
+            before.payload.clear();
         }
-        if follows == Some(false) { 0 } else { protocol(generation).bit() }
+        if !(tail.starts && tail.ends) && (follows || tail.starts) {
+            // One that is too long to be kept is not checked.
+            if before.payload.len() + payload.len() > MOST_BYTES {
+                before.payload.clear();
+            }
+            before.payload.extend_from_slice(payload);
+            if tail.ends && is_whole(generation, header, &before.payload) {
+                counts.proofs += 1;
+            }
+        }
+        (before.tail, before.generation) = (tail, generation);
+        if follows { protocol(generation).bit() } else { 0 }
+    }
+
+    /// Other traffic, of which there is enough to say so.
+    const fn is_hopeless(&self) -> bool {
+        let breaks = self.dronecan.breaks + self.cyphal.breaks;
+        breaks > MOST_BREAKS && breaks / 4 > self.dronecan.follows + self.cyphal.follows
     }
 
     /// Nothing of them is there.
-    pub fn is_empty(&self) -> bool {
-        self.dronecan.follows + self.cyphal.follows == 0
+    pub const fn is_empty(&self) -> bool {
+        self.dronecan.follows + self.cyphal.follows == 0 || self.is_hopeless()
     }
 
     /// The number of frames that indicate either; zero for what is not there.
@@ -129,6 +126,31 @@ impl UavcanSigns {
             if is_most && (proofs > 0 || wraps >= ENOUGH_WRAPS && breaks == 0) { follows } else { 0 }
         };
         [(Protocol::DroneCan, count(self.dronecan)), (Protocol::Cyphal, count(self.cyphal))]
+    }
+}
+
+impl Followed {
+    /// Whether a frame is as this one asks for.
+    fn is_followed_by(&self, tail: Tail, generation: Generation) -> bool {
+        if tail.starts {
+            return self.tail.ends
+                && self.generation == generation
+                && tail.transfer == (self.tail.transfer + 1) % 32;
+        }
+        !self.tail.ends && tail.transfer == self.tail.transfer && tail.toggle != self.tail.toggle
+    }
+}
+
+/// The time since its start that a node reports, in seconds, if that is what the frame is.
+fn uptime(generation: Generation, header: Header, tail: Tail, payload: &[u8]) -> Option<u32> {
+    let is_status = header.purpose == Purpose::Message
+        && header.port == status_port(generation)
+        && header.source.is_some()
+        && tail.starts
+        && tail.ends;
+    match payload {
+        &[a, b, c, d, _, _, _] if is_status => Some(u32::from_le_bytes([a, b, c, d])),
+        _ => None,
     }
 }
 

@@ -271,6 +271,62 @@ fn what_a_type_does_not_allow_is_said() {
     assert!(said[0].contains("more elements than its array can have"), "{said:?}");
 }
 
+/// Frames that others have published: a file that PX4's bootloader was read (PX4-Autopilot, issue 2568), and a motor controller of Zubax (the
+/// documentation of pycyphal's candump media).
+#[test]
+fn recorded_frames_are_read() {
+    let px4 = [
+        "1E3081FD#230D007B0100009B",
+        "1E3081FD#2F66732F6D69633B",
+        "1E3081FD#726F73642F66771B",
+        "1E3081FD#2F632F623334323B",
+        "1E3081FD#316331342E62691B",
+        "1E3081FD#6E2E76616C69647B",
+    ];
+    let said = lines(Generation::DroneCan, &px4.map(|frame| (0.0, frame)));
+    assert_eq!(said.len(), 1, "{said:?}");
+    assert!(
+        said[0].starts_with(
+            "dronecan 125 > 1 uavcan.protocol.file.Read: service 48, priority 30, transfer 27, request.offset 97024, \
+             request.path.path \"/fs/microsd/fw/c/b3421c14.bin.valid\""
+        ),
+        "{said:?}"
+    );
+    let zubax = [
+        "0C60647D#020000FB",
+        "10606E7D#00000000000000BB",
+        "10606E7D#000000000000001B",
+        "10606E7D#000000000000003B",
+        "10606E7D#0000C6565B",
+        "1060787D#00000000000000BB",
+        "1060787D#0000C07F147CB71B",
+        "1060787D#412BCC7B",
+        "10608C7D#73000000000000FB",
+        "1060967D#00000000000000BB",
+        "1060967D#00313E5B",
+        "1460827D#7754A643E06A96BB",
+        "1460827D#430000000000001B",
+        "1460827D#EE3C7B",
+        "1460A07D#335DB35CD85CFB",
+        "107D557D#5F000000000000FB",
+    ];
+    let mut types = DataTypes::with(&[]).0;
+    types.name_subject(120, "reg.udral.physics.electricity.PowerTs.0.1").unwrap();
+    let records: Vec<_> = (0..).zip(zubax).map(|(ms, frame)| at(f64::from(ms), frame)).collect();
+    let said = events(Uavcan::new(Generation::Cyphal, types.into()), &records);
+    let said: Vec<_> = said.iter().map(ToString::to_string).collect();
+    assert!(said.len() == 8 && said.iter().all(|line| line.starts_with("cyphal 125 > all ")), "{said:?}");
+    assert!(
+        said[2].contains(
+            "timestamp.microsecond 0, value.current.ampere not available, value.voltage.volt 22.936562 V"
+        ),
+        "{said:?}"
+    );
+    assert!(said[7].contains("uavcan.node.Heartbeat.1.0") && said[7].contains("uptime 95 s"), "{said:?}");
+    assert_eq!(found(&zubax.map(str::to_owned)), [Protocol::Cyphal]);
+    assert_eq!(found(&px4.map(str::to_owned)), [Protocol::DroneCan]);
+}
+
 fn found(frames: &[String]) -> Vec<Protocol> {
     let records: Vec<_> = frames.iter().enumerate().map(|(ms, frame)| at(ms as f64, frame)).collect();
     let mut found = Vec::new();

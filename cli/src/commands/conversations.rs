@@ -48,8 +48,8 @@ pub struct Args {
     live: LiveArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Only this protocol, on every channel: isotp, uds, kwp2000, obd, j1939, nmea2000, canopen, devicenet, xcp or ccp. Several with commas, or repeated. isotp
-    /// alone shows transfers as they are.
+    /// Only this protocol, on every channel: isotp, uds, kwp2000, obd, j1939, nmea2000, canopen, devicenet, xcp, ccp, dronecan or cyphal. Several
+    /// with commas, or repeated. isotp alone shows transfers as they are.
     #[arg(long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
     protocols: Vec<Protocol>,
     #[command(flatten)]

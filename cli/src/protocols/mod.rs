@@ -13,6 +13,7 @@ use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 use cantap_work::a2l;
+use cantap_work::dsdl::{self, SubjectType};
 use cantap_work::odx::{self, OdxPath};
 use cantap_work::reading::Reading;
 use cantap_work::report::Reporter;
@@ -45,6 +46,14 @@ pub struct ProtocolArgs {
     /// The same for CCP.
     #[arg(long = "ccp", value_name = "MASTER:SLAVE")]
     ccp: Vec<MasterSlave>,
+    /// A folder with data types of DroneCAN or Cyphal (DSDL), in addition to the public ones: the one in which the outermost namespaces are. Can be
+    /// repeated.
+    #[arg(long = "dsdl", value_name = "FOLDER")]
+    dsdl: Vec<PathBuf>,
+    /// The data type of a subject of Cyphal, as 1620=uavcan.si.sample.voltage.Scalar.1.0. Can be repeated. Others are those that nodes name in their
+    /// registers, or bytes.
+    #[arg(long = "subject", value_name = "NUMBER=TYPE")]
+    subjects: Vec<SubjectType>,
 }
 
 fn pair_help() -> String {
@@ -73,7 +82,8 @@ impl ProtocolArgs {
             ccp: self.ccp.clone(),
             descriptions: a2l::load(&self.a2l, &reporter(quiet))?,
         };
-        Ok(Options { pairs, sheets, descriptions, calibration, ..Options::default() })
+        let types = dsdl::load(&self.dsdl, &self.subjects, &reporter(quiet))?;
+        Ok(Options { pairs, sheets, descriptions, calibration, types, ..Options::default() })
     }
 }
 
@@ -85,7 +95,7 @@ fn reporter(quiet: bool) -> Reporter {
 /// [`ProtocolArgs`] mean something with `--protocols` only. For `Command::mut_args` of a command that has it.
 pub fn needs_protocols(arg: Arg) -> Arg {
     match arg.get_id().as_str() {
-        "pairs" | "sheets" | "odx" | "a2l" | "xcp" | "ccp" => arg.requires("protocols"),
+        "pairs" | "sheets" | "odx" | "a2l" | "xcp" | "ccp" | "dsdl" | "subjects" => arg.requires("protocols"),
         _ => arg,
     }
 }

@@ -241,3 +241,56 @@ fn a_makers_pairs_are_read_alike_in_every_form() {
         "{err}"
     );
 }
+
+/// DroneCAN and Cyphal on two channels, found and told apart; a user's own data types, and one named for a subject.
+#[test]
+fn dronecan_and_cyphal_are_read_with_their_types_and_a_users_own() {
+    let lines = (1..5).flat_map(|second| {
+        [
+            format!("({second}.000000) can0 1001550A#0{second}0000008C0000C{second}\n"),
+            format!("({second}.100000) can0 1051FF0A#2AC{second}\n"),
+            format!("({second}.000000) can1 107D552A#0{second}00000001020BE{second}\n"),
+            format!("({second}.100000) can1 1065562A#00004841E{second}\n"),
+        ]
+    });
+    let log: String = lines.collect();
+    let (code, out, err) = cantap("drones", &log, &[]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(
+        err.contains("channel 1 speaks dronecan\n") && err.contains("channel 2 speaks cyphal\n"),
+        "{err}"
+    );
+    let line = "(2.000000) can0 dronecan 10 > all uavcan.protocol.NodeStatus: data_type 341, priority 16, transfer 2, uptime_sec 2 s, \
+                health 2 (error), mode 1 (initialization), sub_mode 4, vendor_specific_status_code 0\n";
+    assert!(out.contains(line), "{out}");
+    assert!(out.contains("data type 20991: data_type 20991, priority 16, transfer 1, data 2A\n"), "{out}");
+    assert!(
+        out.contains("uavcan.node.Heartbeat.1.0: subject 7509") && out.contains("mode.value 2 (maintenance)"),
+        "{out}"
+    );
+    assert!(out.contains("subject 1366: subject 1366, priority 4, transfer 1, data 00 00 48 41\n"), "{out}");
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("conversations").join("drones");
+    std::fs::create_dir_all(directory.join("types/own/deeper")).unwrap();
+    std::fs::write(directory.join("types/own/20991.Gear.uavcan"), "uint8 gear_pct  # of all\n").unwrap();
+    std::fs::write(directory.join("types/own/deeper/Wrong.uavcan"), "uint99 a\n").unwrap();
+    let named = ["--dsdl", "types", "--subject", "1366=uavcan.si.unit.voltage.Scalar.1.0"];
+    let (code, out, err) = cantap("drones", &log, &named);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("cantap: own.deeper.Wrong: line 1: there is no type own.deeper.uint99\n"), "{err}");
+    assert!(out.contains("own.Gear: data_type 20991, priority 16, transfer 1, gear_pct 42 %\n"), "{out}");
+    assert!(
+        out.contains(
+            "uavcan.si.unit.voltage.Scalar.1.0: subject 1366, priority 4, transfer 1, volt 12.5 V\n"
+        ),
+        "{out}"
+    );
+    for (arguments, code, what) in [
+        (["--subject", "1366=own.Nothing.1.0"], 1, "is called 'own.Nothing.1.0'"),
+        (["--subject", "9000=uavcan.si.unit.voltage.Scalar.1.0"], 2, "subjects from 0 to 8191"),
+        (["--dsdl", "nowhere"], 1, "cannot read data types in nowhere"),
+        (["--dsdl", "types/own/deeper/none"], 1, "cannot read data types"),
+    ] {
+        let (exit, _, err) = cantap("drones", &log, &arguments);
+        assert!(exit == Some(code) && err.contains(what), "{arguments:?}: {err}");
+    }
+}

@@ -21,6 +21,7 @@ pub fn condition(text: &str, decoder: &Decoder, options: &Options) -> Result<Con
         sheets: options.sheets.clone(),
         descriptions: options.descriptions.clone(),
         calibration: options.calibration.clone(),
+        types: options.types.clone(),
     };
     let listener = Watcher { options, conversations: None, events: Vec::new() };
     Condition::with_listener(text, decoder, Box::new(listener))

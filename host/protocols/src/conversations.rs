@@ -12,11 +12,13 @@ use crate::canopen::{CanOpen, Sheet};
 use crate::ccp::Ccp;
 use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
+use crate::dsdl::{DataTypes, Generation};
 use crate::iso_tp::{IsoTp, KnownPairs};
 use crate::j1939::{Groups, J1939};
 use crate::odx::Descriptions;
 use crate::signs::FAMILY;
 use crate::survey::DiagnosticsSigns;
+use crate::uavcan::Uavcan;
 use crate::watch::Begun;
 use crate::xcp::Xcp;
 use crate::{Assembler, Event, Evidence, Party, Protocol, UnderWay};
@@ -36,12 +38,14 @@ pub struct Options {
     pub descriptions: Option<Arc<Descriptions>>,
     /// Connections of XCP and CCP, and what is at which address.
     pub calibration: Known,
+    /// Data types of DroneCAN and Cyphal; without them, those that are built in.
+    pub types: Option<Arc<DataTypes>>,
 }
 
 /// Takes records and returns the events of all protocols, in the order of completion.
 pub struct Conversations {
     /// Those that a channel needs, or has needed.
-    readers: [Option<Box<dyn Assembler + Send + Sync>>; 6],
+    readers: [Option<Box<dyn Assembler + Send + Sync>>; 8],
     /// J1939 and NMEA 2000: a channel may have one of them, and the other later.
     family: Option<Box<J1939>>,
     /// The protocols of each channel.
@@ -72,6 +76,8 @@ const OF_DEVICENET: u8 = 4;
 const OF_FAMILY: u8 = 8;
 const OF_XCP: u8 = 16;
 const OF_CCP: u8 = 32;
+const OF_DRONECAN: u8 = 64;
+const OF_CYPHAL: u8 = 128;
 
 /// The readers that a channel with these protocols needs.
 fn readers_of(spoken: u16) -> u8 {
@@ -82,6 +88,8 @@ fn readers_of(spoken: u16) -> u8 {
         | has(Protocol::DeviceNet.bit(), OF_DEVICENET)
         | has(Protocol::Xcp.bit(), OF_XCP)
         | has(Protocol::Ccp.bit(), OF_CCP)
+        | has(Protocol::DroneCan.bit(), OF_DRONECAN)
+        | has(Protocol::Cyphal.bit(), OF_CYPHAL)
 }
 
 /// Whose groups a channel with these protocols has.
@@ -184,6 +192,12 @@ impl Conversations {
                 OF_CANOPEN => Box::new(CanOpen::new(options.sheets.clone())),
                 OF_XCP => Box::new(Xcp::new(options.calibration.clone())),
                 OF_CCP => Box::new(Ccp::new(options.calibration.clone())),
+                of @ (OF_DRONECAN | OF_CYPHAL) => {
+                    let types = options.types.clone().unwrap_or_else(DataTypes::built_in);
+                    let is_cyphal = of == OF_CYPHAL;
+                    let generation = if is_cyphal { Generation::Cyphal } else { Generation::DroneCan };
+                    Box::new(Uavcan::new(generation, types))
+                }
                 _ => Box::new(DeviceNet::new()),
             });
         }

@@ -15,6 +15,7 @@ mod condition;
 mod conversations;
 pub mod devicenet;
 pub mod diagnostics;
+pub mod dsdl;
 mod event;
 mod event_kind;
 pub mod iso_tp;
@@ -34,6 +35,7 @@ mod table;
 #[cfg(test)]
 mod testing;
 mod text;
+mod uavcan;
 mod watch;
 pub mod xcp;
 

@@ -194,6 +194,12 @@ impl Overview {
         node.last_ns = node.last_ns.max(event.time_ns);
         node.events += 1;
         node.faults += u64::from(event.is_fault());
+        if let Some(state) = crate::uavcan::state(event) {
+            node.state = Some(state);
+        }
+        if let Some(name) = crate::uavcan::node_name(event) {
+            node.identity = Some(name);
+        }
         match event.kind {
             EventKind::State | EventKind::BootUp => node.state = Some(event.title.to_string()),
             EventKind::HeartbeatBack => {
@@ -305,7 +311,8 @@ fn subject(event: &Event) -> Option<Party> {
             }
             _ => None,
         },
-        Protocol::DeviceNet
+        Protocol::DroneCan | Protocol::Cyphal if event.kind == EventKind::Message => known(event.from),
+        Protocol::DeviceNet | Protocol::DroneCan | Protocol::Cyphal
             if matches!(event.kind, EventKind::Exchange | EventKind::Refusal | EventKind::NoResponse) =>
         {
             known(event.to)

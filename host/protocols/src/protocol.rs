@@ -27,6 +27,10 @@ pub enum Protocol {
     Xcp,
     /// CCP 2.1.
     Ccp,
+    /// DroneCAN, which was UAVCAN v0.
+    DroneCan,
+    /// Cyphal on CAN, which was UAVCAN v1.
+    Cyphal,
 }
 
 impl Protocol {
@@ -42,6 +46,8 @@ impl Protocol {
         Self::DeviceNet,
         Self::Xcp,
         Self::Ccp,
+        Self::DroneCan,
+        Self::Cyphal,
     ];
 
     /// Its name in text, JSON and on the command line.
@@ -57,6 +63,8 @@ impl Protocol {
             Self::DeviceNet => "devicenet",
             Self::Xcp => "xcp",
             Self::Ccp => "ccp",
+            Self::DroneCan => "dronecan",
+            Self::Cyphal => "cyphal",
         }
     }
 
@@ -110,7 +118,7 @@ mod tests {
     /// length.
     #[test]
     fn every_protocol_can_be_named() {
-        assert_eq!(Protocol::ALL.len(), Protocol::Ccp as usize + 1);
+        assert_eq!(Protocol::ALL.len(), Protocol::Cyphal as usize + 1);
         for (number, protocol) in Protocol::ALL.into_iter().enumerate() {
             assert_eq!(protocol as usize, number);
             assert_eq!(protocol.name().parse(), Ok(protocol));

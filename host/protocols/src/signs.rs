@@ -7,6 +7,7 @@ use crate::canopen::CanOpenSigns;
 use crate::ccp::signs::SessionFinder;
 use crate::devicenet::DeviceNetSigns;
 use crate::j1939::{self, Header};
+use crate::uavcan::UavcanSigns;
 use crate::xcp::signs::ConnectFinder;
 use crate::{Event, Party, Protocol, nmea2000};
 
@@ -18,6 +19,7 @@ pub(crate) struct Signs {
     pub devicenet: DeviceNetSigns,
     pub xcp: ConnectionSigns<ConnectFinder>,
     pub ccp: ConnectionSigns<SessionFinder>,
+    pub uavcan: UavcanSigns,
 }
 
 /// Numbers of data frames with 29 bits.
@@ -44,6 +46,10 @@ impl Signs {
         if frame.id().is_extended() {
             if wanted & FAMILY != 0 && !frame.is_remote() {
                 of |= self.extended.take(frame, wanted);
+            }
+            // Always, since they show that frames are not the family's.
+            if !frame.is_remote() {
+                of |= self.uavcan.take(frame) & wanted;
             }
         } else if wanted & Protocol::CanOpen.bit() != 0 && self.canopen.take(frame) {
             of |= Protocol::CanOpen.bit();
@@ -80,7 +86,7 @@ impl Signs {
 
     /// Forgets the counts of what other traffic contradicts, and of what there was nothing of; returns whether any are left.
     pub fn keep_plausible(&mut self) -> bool {
-        let Self { extended, canopen, devicenet, xcp, ccp } = self;
+        let Self { extended, canopen, devicenet, xcp, ccp, uavcan } = self;
         let known = extended.marine + extended.vehicle;
         if known == 0 || known <= extended.all / 10 {
             *extended = ExtendedSigns::default();
@@ -91,7 +97,11 @@ impl Signs {
         if devicenet.count() == 0 {
             *devicenet = DeviceNetSigns::default();
         }
-        extended.all > 0 || canopen.count() > 0 || devicenet.count() > 0 || xcp.count() + ccp.count() > 0
+        if uavcan.is_empty() {
+            *uavcan = UavcanSigns::default();
+        }
+        let counts = [extended.all, canopen.count(), devicenet.count(), xcp.count(), ccp.count()];
+        counts.into_iter().any(|count| count > 0) || !uavcan.is_empty()
     }
 
     /// The protocols, with the number of messages that indicate them. Some are known already.
@@ -103,7 +113,9 @@ impl Signs {
             count if is_canopen && (canopen > 0 || count < CONVINCING_BESIDE_CANOPEN) => 0,
             count => count,
         };
-        let [marine, vehicle] = self.extended.found(known);
+        let [dronecan, cyphal] = self.uavcan.found();
+        let is_uavcan = dronecan.1 + cyphal.1 > 0;
+        let [marine, vehicle] = if is_uavcan { [0, 0] } else { self.extended.found(known) };
         [
             (Protocol::J1939, vehicle),
             (Protocol::Nmea2000, marine),
@@ -111,6 +123,8 @@ impl Signs {
             (Protocol::DeviceNet, devicenet),
             (Protocol::Xcp, self.xcp.count()),
             (Protocol::Ccp, self.ccp.count()),
+            dronecan,
+            cyphal,
         ]
         .into_iter()
         .filter(move |(protocol, count)| *count > 0 && known & protocol.bit() == 0)

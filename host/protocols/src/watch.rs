@@ -18,7 +18,12 @@ const CONVINCING: u32 = 5;
 const MOST_HELD: usize = 1024;
 
 /// The protocols that are looked for here. [`crate::conversations::Conversations`] finds those of diagnostics by itself.
-const WATCHED: u16 = FAMILY | Protocol::CanOpen.bit() | Protocol::DeviceNet.bit() | Protocol::CALIBRATION;
+const WATCHED: u16 = FAMILY
+    | Protocol::CanOpen.bit()
+    | Protocol::DeviceNet.bit()
+    | Protocol::CALIBRATION
+    | Protocol::DroneCan.bit()
+    | Protocol::Cyphal.bit();
 
 /// Looks for protocols that a survey has not found, on every channel, for as long as records come.
 pub struct Watch {

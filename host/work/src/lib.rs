@@ -58,6 +58,8 @@ pub mod disturbance;
 #[cfg(feature = "buses")]
 pub mod doctor;
 #[cfg(feature = "buses")]
+pub mod dsdl;
+#[cfg(feature = "buses")]
 pub mod gateway;
 pub mod interrupt;
 #[cfg(feature = "buses")]

@@ -40,6 +40,11 @@ pub(super) fn key_of(event: &Event) -> Option<ObjectKey> {
             let numbers = [Some(bits("class")?), Some(bits("instance")?), bits("attribute")];
             Some(ObjectKey::Numbered("class", numbers))
         }
+        // A parameter or a register, or a message.
+        Protocol::DroneCan | Protocol::Cyphal => match event.kind {
+            EventKind::Message => Some(ObjectKey::Titled(event.title.clone())),
+            _ => crate::uavcan::parameter(event).map(|(name, _)| ObjectKey::Titled(name.into())),
+        },
         Protocol::IsoTp | Protocol::Xcp | Protocol::Ccp => None,
     }
 }
@@ -62,6 +67,9 @@ pub(super) fn object_text(event: &Event) -> String {
             let class = format!("class {} instance {}", value("class"), value("instance"));
             class + attribute.as_deref().unwrap_or_default()
         }
+        Protocol::DroneCan | Protocol::Cyphal if event.kind != EventKind::Message => {
+            crate::uavcan::parameter(event).map_or_else(String::new, |(name, _)| name)
+        }
         _ => event.title.to_string(),
     }
 }
@@ -75,12 +83,20 @@ pub(super) fn name_of(event: &Event) -> Option<String> {
         Protocol::CanOpen => meaning("index"),
         Protocol::J1939 | Protocol::Nmea2000 => Some(event.title.to_string()),
         Protocol::DeviceNet => meaning("class"),
-        Protocol::Kwp2000 | Protocol::IsoTp | Protocol::Xcp | Protocol::Ccp => None,
+        Protocol::Kwp2000
+        | Protocol::IsoTp
+        | Protocol::Xcp
+        | Protocol::Ccp
+        | Protocol::DroneCan
+        | Protocol::Cyphal => None,
     }
 }
 
 /// The object's value as text, if it is of a kind that need not change.
 pub(super) fn value_of(event: &Event) -> Option<String> {
+    if let Some((_, value)) = crate::uavcan::parameter(event) {
+        return Some(short(value));
+    }
     let has_value = match event.protocol {
         Protocol::Uds => event.fields.iter().filter(|field| field.name == "did").count() == 1,
         Protocol::Kwp2000 => true,

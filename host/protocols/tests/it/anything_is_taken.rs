@@ -20,7 +20,9 @@ fn record(time_ns: i64, id: Id, data: &[u8]) -> TraceRecord {
 /// Identifiers that protocols use, few of each, so that frames collide.
 fn known_id(random: &mut fastrand::Rng) -> Id {
     let node = random.u32(0..4);
-    match random.u8(0..8) {
+    match random.u8(0..10) {
+        8 => Id::extended_truncated([0x1001_5500, 0x1E01_8A80, 0x1E01_0180][random.usize(0..3)] | node),
+        9 => Id::extended_truncated([0x107D_5500, 0x136B_9500, 0x126B_8080][random.usize(0..3)] | node),
         0 => Id::standard_truncated(0x7E0 | node | random.u32(0..2) << 3),
         1 => Id::standard_truncated(random.u32(0..16) << 7 | node),
         2 => Id::standard_truncated(0x400 | node << 3 | random.u32(0..8)),
@@ -53,6 +55,10 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
             // Frames that begin, continue and end transfers.
             if let Some(first) = data.first_mut().filter(|_| random.bool()) {
                 *first = [0x10, 0x20, 0x21, 0x22, 0x30, 0x03, 0x40, 0x43, 0x60, 0x80][random.usize(0..10)];
+            }
+            if let Some(last) = data.last_mut().filter(|_| random.bool()) {
+                *last =
+                    [0x80, 0x20, 0x40, 0x60, 0xA0, 0xC0, 0xE0, 0x00][random.usize(0..8)] | random.u8(0..2);
             }
             let mut record = record(time_ns, known_id(&mut random), &data);
             if random.u8(..) == 0 {
@@ -114,7 +120,7 @@ fn resident() -> usize {
 type Beginning = fn(u32) -> (Id, Vec<u8>);
 
 #[cfg(target_os = "linux")]
-const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
+const BEGINNINGS: [(&str, &[Protocol], Beginning); 11] = [
     ("ISO-TP, 11 bits", &[Protocol::IsoTp], |at| {
         (Id::standard_truncated(at), vec![0x1F, 0xFF, 0x62, 1, 2, 3, 4, 5])
     }),
@@ -196,6 +202,14 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
         let (node, count) = (at / 64 % 64, (at % 64) as u8);
         let second = if count == 0 { 0 } else { 0x40 | count };
         (Id::standard_truncated(0x404 | node << 3), vec![0x80 | 1, second, 0x10, 1, 2, 3, 4, 5])
+    }),
+    ("DroneCAN transfers", &[Protocol::DroneCan], |at| {
+        (Id::extended_truncated(0x1000_0001 | at << 8 & 0xFF_FF00), vec![1, 2, 3, 4, 5, 6, 7, 0x80])
+    }),
+    // Requests that nobody answers, of every service and client.
+    ("Cyphal requests", &[Protocol::Cyphal], |at| {
+        let (service, client) = (at % 512, at / 512 % 128);
+        (Id::extended_truncated(0x1300_0080 | service << 14 | client), vec![(at % 32) as u8 | 0xE0])
     }),
 ];
 

@@ -1,0 +1,100 @@
+//! Data types of DroneCAN and Cyphal (DSDL), as users name them.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::Arc;
+
+use anyhow::Context as _;
+use cantap_protocols::dsdl::{DataTypes, Source};
+
+use crate::report::Reporter;
+
+/// How many subjects Cyphal has.
+const SUBJECTS: u16 = 8192;
+/// How many files of definitions a folder may have.
+const MOST_FILES: usize = 20_000;
+/// How long one may be, in bytes.
+const MOST_BYTES: u64 = 1 << 20;
+
+/// A subject of Cyphal and the data type of its messages.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SubjectType {
+    subject: u16,
+    name: String,
+}
+
+impl FromStr for SubjectType {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let parts = text.split_once('=');
+        let number = parts.and_then(|(number, _)| number.parse().ok()).filter(|number| *number < SUBJECTS);
+        let (Some(subject), Some((_, name))) = (number, parts) else {
+            let example = "1620=uavcan.si.sample.voltage.Scalar.1.0";
+            return Err(format!("write it as NUMBER=TYPE, with subjects from 0 to 8191: {example}"));
+        };
+        Ok(Self { subject, name: name.to_owned() })
+    }
+}
+
+/// All definitions in a folder and the folders in it, which are the outermost namespaces, in the order of their paths. Links are not followed.
+///
+/// # Errors
+///
+/// Whatever keeps a folder or a definition from being read; more than 20 000 of them, or one of more than 1 MiB.
+pub fn read_folder(folder: &Path) -> io::Result<Vec<Source>> {
+    let (mut sources, mut folders) = (Vec::new(), vec![(folder.to_owned(), String::new())]);
+    while let Some((folder, namespace)) = folders.pop() {
+        for entry in std::fs::read_dir(&folder)? {
+            let entry = entry?;
+            let Ok(name) = entry.file_name().into_string() else { continue };
+            let (kind, path) = (entry.file_type()?, format!("{namespace}{name}"));
+            if kind.is_dir() && !name.starts_with('.') {
+                folders.push((entry.path(), format!("{path}/")));
+            } else if kind.is_file() && Source::has_name(&name) {
+                if sources.len() == MOST_FILES || entry.metadata()?.len() > MOST_BYTES {
+                    let what = format!("{}: too many or too long definitions", entry.path().display());
+                    return Err(io::Error::other(what));
+                }
+                let text = String::from_utf8_lossy(&std::fs::read(entry.path())?).into_owned();
+                sources.push(Source { path, text });
+            }
+        }
+    }
+    sources.sort_by(|a, b| a.path.cmp(&b.path));
+    Ok(sources)
+}
+
+/// The built-in types with those of the folders; `None` without folders and subjects. What is not understood is reported.
+///
+/// # Errors
+///
+/// A folder cannot be read or has no definitions; a subject's type does not exist.
+pub fn load(
+    folders: &[PathBuf],
+    subjects: &[SubjectType],
+    reporter: &Reporter,
+) -> anyhow::Result<Option<Arc<DataTypes>>> {
+    if folders.is_empty() && subjects.is_empty() {
+        return Ok(None);
+    }
+    let mut own = Vec::new();
+    for folder in folders {
+        let name = folder.display();
+        let sources = read_folder(folder).with_context(|| format!("cannot read data types in {name}"))?;
+        anyhow::ensure!(
+            !sources.is_empty(),
+            "there is no data type in {name}; give the folder in which the outermost namespaces are, with files *.uavcan or *.dsdl in them"
+        );
+        own.extend(sources);
+    }
+    let (mut types, problems) = DataTypes::with(&own);
+    for problem in problems {
+        reporter.note(problem);
+    }
+    for SubjectType { subject, name } in subjects {
+        types.name_subject(*subject, name)?;
+    }
+    Ok(Some(Arc::new(types)))
+}

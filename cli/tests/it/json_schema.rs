@@ -133,6 +133,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("uds raw -d virtual:car 22F190", 0, &["conversations"]),
     ("canopen scan -d virtual:load=0 -b 500k 1-5", 1, &["canopen_scan"]),
     ("canopen nmt -d virtual:load=0 -b 500k 5 start", 0, &["conversations"]),
+    ("canopen drive -d virtual:canopen -b 500k 5 status", 0, &["canopen_drive"]),
     ("canopen sync -d virtual:load=0 -b 500k --period 10ms -n 3", 0, &["conversations"]),
     ("canopen heartbeat -d virtual:load=0 -b 500k 5 --period 10ms -n 3", 0, &["conversations"]),
     ("j1939 claim -d virtual:load=0 -b 250k", 0, &["conversations"]),

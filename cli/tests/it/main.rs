@@ -29,6 +29,7 @@ mod device_time;
 mod diagnostics;
 mod disturb;
 mod doctor;
+mod drive;
 mod emulated;
 mod emulated_autobaud;
 mod emulated_clock;

@@ -4,6 +4,7 @@
 //! has a bus drives it; the `cantap` command does so with a device. Every machine ends in bounded time, whatever the other side does.
 
 mod answer;
+pub mod drive;
 pub mod exchange;
 pub mod lss;
 pub mod node_scan;

@@ -45,6 +45,8 @@ mod in_folder;
 mod json_schema;
 #[cfg(target_os = "linux")]
 mod list;
+#[cfg(unix)]
+mod marine;
 mod mcap;
 mod message_names;
 mod misbehaving_devices;

@@ -18,7 +18,6 @@ use self::send::{GLOBAL, SendArgs};
 use crate::args;
 use crate::database_args::DatabaseArgs;
 use crate::speak_args::SpeakArgs;
-use crate::usage_error::usage;
 use cantap_work::speaking::Speaking;
 
 /// The group of address claims.

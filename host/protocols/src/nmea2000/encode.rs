@@ -74,17 +74,24 @@ fn choose(name: &str, values: &[(&str, &str)]) -> Result<&'static Group, EncodeE
     }
 }
 
-/// Which occurrence of a field a name means: its plain name, and the how manieth from 1.
+/// Which field a name means: its plain name, and the how manieth of that name, from 1. A name as it is written comes before a number behind a
+/// name, so that `Unknown_1` is `Unknown 1` if there is one, and that before a name without its blanks.
 fn occurrence(group: &Group, name: &str) -> Option<(String, usize)> {
-    let has = |name: &str| group.fields.iter().any(|field| is_value(field) && plain(&field.name) == name);
+    let fields = || group.fields.iter().filter(|field| is_value(field));
+    let words = |name: &str| {
+        let split = name.split(|letter: char| !letter.is_alphanumeric()).filter(|word| !word.is_empty());
+        split.map(str::to_lowercase).collect::<Vec<_>>()
+    };
     let whole_name = plain(name);
-    if has(&whole_name) {
+    if fields().any(|field| words(&field.name) == words(name)) {
         return Some((whole_name, 1));
     }
-    let (name, number) = name.rsplit_once('_')?;
-    let number = number.parse().ok().filter(|number| *number > 0)?;
-    let name = plain(name);
-    has(&name).then_some((name, number))
+    let has = |name: &str| fields().any(|field| plain(&field.name) == name);
+    let numbered = name.rsplit_once('_').and_then(|(name, number)| {
+        let number = number.parse().ok().filter(|number| *number > 0)?;
+        Some((plain(name), number)).filter(|(name, _)| has(name))
+    });
+    numbered.or_else(|| has(&whole_name).then_some((whole_name, 1)))
 }
 
 /// Whether a field has a value, and is not there to fill a place.

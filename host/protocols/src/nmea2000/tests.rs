@@ -233,6 +233,12 @@ fn comes_back(group: &'static database::Group, data: &[u8], by_name: bool) -> Op
         match encode::encode_as(group, &pairs) {
             Ok(written) => break written,
             Err(EncodeError::TooLong { .. }) => return None,
+            // Random bytes may say that a key's value is longer than the key has it.
+            Err(EncodeError::Value { .. })
+                if group.fields.iter().any(|field| field.field_type == Kind::DynamicFieldValue) =>
+            {
+                return None;
+            }
             Err(EncodeError::Needed { fields }) => {
                 given.splice(0..0, fields.into_iter().map(|name| (name, "0".to_owned())));
             }
@@ -312,6 +318,18 @@ fn values_by_name_become_the_bytes_of_their_group() {
         "{said}"
     );
     assert_eq!(position.data.len(), 43 + 8);
+    // The length of a key's value is the key's.
+    let keys = encode(
+        "B&G: key-value data",
+        &[("Key", "Wind Direction"), ("Value", "1.5 rad"), ("Key_2", "0xFFF"), ("Value_2", "0102")],
+    );
+    let keys = keys.unwrap();
+    let mut fields = Vec::new();
+    describe(keys.pgn, &keys.data, &mut fields);
+    let said: Vec<_> = fields.iter().skip(2).map(ToString::to_string).collect();
+    assert!(said[0].ends_with("(Wind Direction)"), "{said:?}");
+    assert_eq!(said[1..3], ["Length 2 bytes", "Value 1.5 rad"]);
+    assert_eq!(said[3..], ["Key 4095", "Length 2 bytes", "Value 01 02"]);
     let text = |group: &str, values: &[(&str, &str)]| encode(group, values).unwrap_err().to_string();
     for (group, values, expected) in [
         ("positon", &[][..], "CANboat's database has no group 'positon'"),

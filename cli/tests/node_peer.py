@@ -1,6 +1,6 @@
 """Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
-uds, memory, ecus, servers, obd, obd_29, obd_on_uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
+uds, memory, ecus, servers, obd, obd_29, obd_on_uds, canopen, drive, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
 tester HOST PORT                                     prints "ready", and then what udsoncan has read of the ECU that is asked with 7E0
 """
 
@@ -408,6 +408,53 @@ def serve_canopen(host, port):
             say(0x17, 0)
 
     network.subscribe(0x7E5, lss)
+    wait()
+    network.notifier.stop()
+    network.bus.shutdown()
+
+
+def serve_drive(host, port):
+    """Node 5 is a drive on python-canopen: its server of objects, and the transitions and statuswords of its profile 402. Motion takes no time."""
+    import pathlib
+
+    import canopen
+    from canopen.profiles.p402 import State402
+
+    network = canopen.Network()
+    network.bus = bus(host, port)
+    network.notifier = can.Notifier(network.bus, network.listeners, 0.01)
+    folder = pathlib.Path(__file__).resolve().parents[2]
+    node = network.create_node(5, str(folder / "host" / "scripts" / "nodes" / "drive.eds"))
+    drive = {"state": "SWITCH ON DISABLED", "word": 0, "flags": 0x400}
+
+    def show():
+        node.sdo[0x6041].raw = State402.SW_MASK[drive["state"]][1] | drive["flags"] | 0x200
+
+    def written(index, subindex, od, data):
+        number = int.from_bytes(data, "little", signed=True)
+        if index == 0x6060:
+            node.sdo[0x6061].raw = number
+        elif index == 0x60FF:
+            node.sdo[0x606C].raw = number if drive["state"] == "OPERATION ENABLED" else 0
+        elif index == 0x6040:
+            for (before, after), command in State402.TRANSITIONTABLE.items():
+                if before == drive["state"] and command == number & 0x8F:
+                    drive["state"] = after
+                    break
+            if drive["state"] != "OPERATION ENABLED":
+                node.sdo[0x606C].raw = 0
+            elif number & ~drive["word"] & 0x10:
+                drive["flags"] |= 0x1000
+                if node.sdo[0x6061].raw == 1:
+                    start = node.sdo[0x6064].raw if number & 0x40 else 0
+                    node.sdo[0x6064].raw = start + node.sdo[0x607A].raw
+            if not number & 0x10 and node.sdo[0x6061].raw == 1:
+                drive["flags"] &= ~0x1000
+            drive["word"] = number
+            show()
+
+    node.add_write_callback(written)
+    show()
     wait()
     network.notifier.stop()
     network.bus.shutdown()

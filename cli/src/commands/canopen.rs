@@ -1,5 +1,6 @@
 //! `cantap canopen`: talks with nodes.
 
+mod drive;
 mod lss;
 mod objects;
 mod scan;
@@ -28,7 +29,9 @@ use crate::usage_error::usage;
                 cantap canopen -d COM5 -b 250k write 5 1017 0 500 --type u16\n  \
                 cantap canopen -d COM5 -b 250k --eds 5:drive.eds read 5 6041\n  \
                 cantap canopen -d COM5 -b 250k nmt 5 start\n  \
-                cantap canopen -d COM5 -b 125k lss --node 12 --store\n\n\
+                cantap canopen -d COM5 -b 125k lss --node 12 --store\n  \
+                cantap canopen -d COM5 -b 1M drive 5 status\n  \
+                cantap canopen -d COM5 -b 1M drive 5 velocity 1500 -t 10s --yes\n\n\
                 It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What \
                 was said is shown as `cantap conversations` does.")]
 pub struct Args {
@@ -91,6 +94,8 @@ enum What {
     },
     /// Find a node that has no number (fast scan), and give it a number and a bit rate.
     Lss(lss::LssArgs),
+    /// Command a drive (CiA 402): its state, its mode, a motion. Each step is confirmed by its statusword.
+    Drive(drive::DriveArgs),
 }
 
 /// How often to send.
@@ -165,6 +170,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             let Some(frame) = Frame::data_frame(id, &[state]) else { bail!("a heartbeat has one byte") };
             repeat(&args.speak, frame, cyclic)?;
         }
+        What::Drive(drive) => drive::run(&args.speak, drive, ns(ANSWER), sheets)?,
         What::Lss(lss) => lss::run(&args.speak, lss, ns(Duration::from_millis(100)))?,
     }
     Ok(ExitCode::SUCCESS)

@@ -1,31 +1,32 @@
 //! `cantap j1939`: acts as a node.
 
+mod send;
+
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::{anyhow, bail};
+use cantap_protocols::active::Machine as _;
 use cantap_protocols::active::station::{Station, StationError, StationJob, StationTiming};
 use cantap_protocols::j1939::J1939;
+use cantap_protocols::nmea2000;
 use cantap_protocols::{Event, EventKind, Party};
 use cantap_trace::grammar;
+use cantap_work::interrupt;
 
-use super::uds::hex::{self, Hex};
+use self::send::{GLOBAL, SendArgs};
 use crate::args;
 use crate::database_args::DatabaseArgs;
 use crate::speak_args::SpeakArgs;
-use crate::usage_error::usage;
 use cantap_work::speaking::Speaking;
 
 /// The group of address claims.
 const CLAIM: u32 = 0xEE00;
 /// Active trouble codes.
 const DM1: u32 = 0xFECA;
-const GLOBAL: u8 = 255;
 /// An off-board diagnostic tool (J1939-81) that accepts any address, without a manufacturer and with a random
 /// number.
 const TOOL: u64 = 1 << 63 | 29 << 40 | 0x7FF << 21;
-/// The longest message, in bytes.
-const MOST_BYTES: usize = 1785;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -33,7 +34,9 @@ const MOST_BYTES: usize = 1785;
                 cantap j1939 -d /dev/ttyACM0 -b 250k claim\n  \
                 cantap j1939 -d COM5 -b 250k request 65260 --to 0\n  \
                 cantap j1939 -d COM5 -b 250k dm1\n  \
-                cantap j1939 -d COM5 -b 250k send 0xEF00 0102030405060708090A --to 3\n\n\
+                cantap j1939 -d COM5 -b 250k send 0xEF00 0102030405060708090A --to 3\n  \
+                cantap j1939 -d COM5 -b 250k send 'Wind Data' 'Wind Speed=6 m/s' Reference=Apparent\n  \
+                cantap j1939 -d COM5 -b 250k send 129025 Latitude=54.3 Longitude=10.1 --period 100ms\n\n\
                 It claims an address first, which takes a quarter of a second, and another one where a node with a \
                 lower NAME has it. It takes part in the bus: it acknowledges, and sends what it is asked for here and \
                 what its address demands.")]
@@ -66,7 +69,7 @@ enum What {
         #[arg(value_parser = pgn)]
         pgn: u32,
         /// Whom to ask: an address, or all.
-        #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
+        #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = send::address)]
         to: u8,
     },
     /// Claim an address, and show who else has one.
@@ -74,55 +77,17 @@ enum What {
     /// Show active trouble codes.
     Dm1 {
         /// Whom to ask: an address, or all.
-        #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
+        #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = send::address)]
         to: u8,
     },
-    /// Send a message of up to 1785 bytes.
-    Send {
-        /// The group: 65260, or 0xFEEC.
-        #[arg(value_parser = pgn)]
-        pgn: u32,
-        /// Its bytes in hexadecimal.
-        #[arg(value_name = "HEX", value_parser = bytes)]
-        data: Bytes,
-        /// The receiver: an address, or all.
-        #[arg(long, value_name = "ADDRESS", default_value = "all", value_parser = address)]
-        to: u8,
-        /// 0, the highest, to 7.
-        #[arg(long, value_name = "N", default_value_t = 6, value_parser = clap::value_parser!(u8).range(0..=7))]
-        priority: u8,
-    },
-}
-
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Bytes(Vec<u8>);
-
-fn bytes(text: &str) -> Result<Bytes, String> {
-    let Hex(data) = hex::bytes(text)?;
-    if data.len() > MOST_BYTES {
-        Err(format!("a message has at most {MOST_BYTES} bytes"))
-    } else {
-        Ok(Bytes(data))
-    }
+    /// Send a message: bytes, or the values of an NMEA 2000 group. More than a frame holds goes by NMEA 2000's fast packet or J1939's transport, as
+    /// the group does.
+    Send(SendArgs),
 }
 
 fn pgn(text: &str) -> Result<u32, String> {
     let advice = || "write a group's number up to 262143, as 65260 or 0xFEEC".to_owned();
-    let pgn = grammar::parameter_group(text).ok_or_else(advice)?;
-    if pgn >> 8 & 0xFF < 240 && pgn & 0xFF != 0 {
-        return Err(
-            "groups below 0xF000 end in 00: the last byte is the address, which --to gives".to_owned()
-        );
-    }
-    Ok(pgn)
-}
-
-fn address(text: &str) -> Result<u8, String> {
-    match (text, args::byte(text)) {
-        ("all", _) => Ok(GLOBAL),
-        (_, Some(address @ 0..=253)) => Ok(address),
-        _ => Err("addresses are 0 to 253 (0x00 to 0xFD), or all".to_owned()),
-    }
+    send::usable(grammar::parameter_group(text).ok_or_else(advice)?)
 }
 
 fn name(text: &str) -> Result<u64, String> {
@@ -141,15 +106,22 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Claim => StationJob::Request { pgn: CLAIM, to: GLOBAL },
         What::Request { pgn, to } => StationJob::Request { pgn: *pgn, to: *to },
         What::Dm1 { to } => StationJob::Request { pgn: DM1, to: *to },
-        What::Send { pgn, data, to, priority } => {
-            if *to != GLOBAL && pgn >> 8 & 0xFF >= 240 {
-                return Err(usage(format!("the group {pgn} goes to all; omit --to")));
+        What::Send(send) => {
+            let message = send.message()?;
+            if send.dry_run {
+                return message.print(args.address, args.speak.json).map(|()| ExitCode::SUCCESS);
             }
-            StationJob::Send { pgn: *pgn, to: *to, priority: *priority, data: data.0.clone() }
+            message.job()
         }
     };
     let device = args.speak.open()?;
-    let mut speaking = args.speak.speak(&device, Box::new(J1939::new(decoder)));
+    let is_marine = match &job {
+        StationJob::SendFast { .. } => true,
+        StationJob::Send { pgn, .. } => nmea2000::is_own(*pgn),
+        _ => false,
+    };
+    let witness = if is_marine { J1939::nmea2000(decoder) } else { J1939::new(decoder) };
+    let mut speaking = args.speak.speak(&device, Box::new(witness));
     let mut station = Station::new(name, args.address, job.clone());
     station.set_timing(StationTiming {
         answer_ns: args::nanoseconds(args.timeout),
@@ -162,11 +134,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let shown = |event: &Event| match &args.what {
         What::Claim => event.kind == EventKind::AddressClaim,
-        What::Send { pgn, .. } => event.from == Party::Node(own) && is_of(event, *pgn),
+        What::Send(_) => event.from == Party::Node(own) && event.kind != EventKind::AddressClaim,
         What::Request { pgn, to } => is_answer(event, *pgn, *to, own),
         What::Dm1 { to } => is_answer(event, DM1, *to, own),
     };
     speaking.show(shown)?;
+    if let What::Send(SendArgs { period: Some(period), count, time, .. }) = &args.what {
+        let sent = repeat(&mut speaking, &mut station, args::nanoseconds(*period), *count, *time, shown)?;
+        eprintln!("cantap: {} sent", send::were(sent));
+    }
     let imposters = station.imposters();
     let ended = finish(&speaking, station.finish(), args);
     if imposters > 0 {
@@ -180,6 +156,34 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     drop(speaking);
     device.stop()?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// Sends the message, which was sent once, again and again. Returns how often it was sent.
+fn repeat(
+    speaking: &mut Speaking<'_>,
+    station: &mut Station,
+    period_ns: u64,
+    count: Option<u32>,
+    time: Option<Duration>,
+    shown: impl Fn(&Event) -> bool,
+) -> anyhow::Result<u32> {
+    let started = Instant::now();
+    let mut sent = 1;
+    while count.is_none_or(|count| sent < count) && time.is_none_or(|time| started.elapsed() < time) {
+        station.send_again(period_ns);
+        // Why it cannot go on is the station's to say.
+        if station.is_done() {
+            break;
+        }
+        match speaking.run(station) {
+            // The usual end.
+            Err(_) if interrupt::requested() => break,
+            result => result?,
+        }
+        speaking.show(&shown)?;
+        sent += u32::from(station.is_done());
+    }
+    Ok(sent)
 }
 
 fn is_of(event: &Event, pgn: u32) -> bool {

@@ -29,6 +29,7 @@ mod device_time;
 mod diagnostics;
 mod disturb;
 mod doctor;
+mod drive;
 mod emulated;
 mod emulated_autobaud;
 mod emulated_clock;
@@ -44,6 +45,8 @@ mod in_folder;
 mod json_schema;
 #[cfg(target_os = "linux")]
 mod list;
+#[cfg(unix)]
+mod marine;
 mod mcap;
 mod message_names;
 mod misbehaving_devices;

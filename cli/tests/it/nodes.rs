@@ -66,6 +66,7 @@ impl Rig {
             ("obd", _) => " --p2 1s",
             ("canopen", Some("lss")) => " --timeout 400ms",
             ("canopen", Some("read" | "write")) => " --timeout 30s",
+            ("canopen", Some("drive")) => " --timeout 30s --confirm 30s",
             _ => "",
         };
         let (code, out, err) = self.run(&format!("{line}{patience}"));
@@ -259,6 +260,37 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
     assert_eq!((&given["vendor_id"], &given["serial_number"]), (&0x29C.into(), &0x4D2.into()), "{given}");
     let (code, _, err) = rig.run("canopen lss");
     assert!(code == Some(1) && err.contains("no node without a number"), "{err}");
+}
+
+/// Its server of objects, its transitions and its statuswords are python-canopen's.
+#[test]
+fn a_drive_on_python_canopen_is_enabled_moved_and_disabled() {
+    let Some(rig) = Rig::new(NO_NODE, "canopen", "drive") else { return };
+    let states = |objects: &[Value]| -> Vec<String> {
+        let states = objects.iter().flat_map(|object| object["states"].as_array().unwrap());
+        states.map(|state| state.as_str().unwrap().to_owned()).collect()
+    };
+    let up = ["switch on disabled", "ready to switch on", "switched on", "operation enabled"];
+    assert_eq!(states(&rig.json("canopen drive 5 enable --yes", "canopen_drive")), up);
+    let down = ["operation enabled", "switched on", "ready to switch on", "switch on disabled"];
+    assert_eq!(states(&rig.json("canopen drive 5 disable", "canopen_drive")), down);
+    for (line, position) in [("1234", 1234), ("-34 --relative", 1200)] {
+        let objects = rig.json(&format!("canopen drive 5 position {line} --yes"), "canopen_drive");
+        let expected: Vec<_> = up.into_iter().chain(["quick stop active", "switch on disabled"]).collect();
+        assert_eq!(states(&objects), expected);
+        let last = objects.last().unwrap();
+        assert_eq!(
+            (&last["position"], &last["mode"], &last["mode_name"]),
+            (&position.into(), &1.into(), &"profile position".into())
+        );
+    }
+    let objects = rig.json("canopen drive 5 velocity -700 -t 300ms --yes", "canopen_drive");
+    assert_eq!(objects.last().unwrap()["velocity"], 0);
+    let (code, _, err) = rig.run("canopen drive 5 velocity -700 -t 300ms --yes --timeout 30s --confirm 30s");
+    assert!(
+        code == Some(0) && err.contains("at velocity -700; it was stopped, and is switch on disabled"),
+        "{err}"
+    );
 }
 
 #[test]

@@ -8,6 +8,7 @@
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`calibration`], [`odx`], [`a2l`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
+//! | [`drive`] | a drive's motion, and how it is left |
 //! | [`obd`] | a vehicle's parameters: who has which, asked again and again, as a table |
 //! | [`changing`], [`disturbance`] | messages whose values change with time; error frames on purpose |
 //! | [`gateway`] | the rules of a gateway, and what they do to a trace |
@@ -57,6 +58,8 @@ pub mod dfu;
 pub mod disturbance;
 #[cfg(feature = "buses")]
 pub mod doctor;
+#[cfg(feature = "buses")]
+pub mod drive;
 #[cfg(feature = "buses")]
 pub mod dsdl;
 #[cfg(feature = "buses")]

@@ -47,6 +47,8 @@ pub struct Sending<'d> {
     withdraws: bool,
     withdrawn: u64,
     stands_still: bool,
+    /// What is sent now is sent because of Ctrl-C.
+    is_farewell: bool,
     /// The error that ended it, where only yes or no could be returned.
     error: Option<anyhow::Error>,
 }
@@ -75,6 +77,7 @@ impl<'d> Sending<'d> {
             withdraws: false,
             withdrawn: 0,
             stands_still: false,
+            is_farewell: false,
             error: None,
         }
     }
@@ -82,6 +85,16 @@ impl<'d> Sending<'d> {
     /// The same for a command that uses the device's records itself, and passes each of them to [`Self::take`].
     pub fn fed(device: &'d Device, recovery: BusOffRecovery, on_sent: Option<OnSent<'d>>) -> Self {
         Self::over(device, Watch::fed(device, recovery.is_wanted()), recovery, on_sent)
+    }
+
+    /// From now on, Ctrl-C ends nothing: what is sent is what has to be sent because of it, or at the end in any case.
+    pub const fn begin_farewell(&mut self) {
+        self.is_farewell = true;
+    }
+
+    /// Whether Ctrl-C ends it.
+    pub fn is_interrupted(&self) -> bool {
+        !self.is_farewell && interrupt::requested()
     }
 
     /// Notes what was on the bus.
@@ -106,7 +119,7 @@ impl<'d> Sending<'d> {
 
     /// Whether nothing more will be sent: frames are stuck, an error came, or Ctrl-C.
     pub fn has_stopped(&self) -> bool {
-        self.stands_still || self.error.is_some() || interrupt::requested()
+        self.stands_still || self.error.is_some() || self.is_interrupted()
     }
 
     fn add(&mut self, ends: &[Transmission]) -> anyhow::Result<()> {
@@ -154,7 +167,7 @@ impl<'d> Sending<'d> {
                 self.watch.excuse();
             }
             self.stands_still |= self.watch.stands_still(|channel, _| due[channel.index()])?;
-            Ok(!self.stands_still && !interrupt::requested())
+            Ok(!self.stands_still && !self.is_interrupted())
         });
         self.or_stop(goes_on)
     }
@@ -167,7 +180,7 @@ impl<'d> Sending<'d> {
                 self.watch.excuse();
             }
             self.stands_still |= self.watch.stands_still(|_, status| (status.tx_pending > 0).then_some(0))?;
-            Ok(!self.stands_still && !interrupt::requested())
+            Ok(!self.stands_still && !self.is_interrupted())
         });
         self.or_stop(goes_on)
     }

@@ -145,6 +145,12 @@ impl<'d> Speaking<'d> {
         result
     }
 
+    /// Runs a client that leaves a machine as it must be left, after Ctrl-C, too, and whatever else was the reason.
+    pub fn run_last(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
+        self.sending.begin_farewell();
+        self.run_to_its_end(machine)
+    }
+
     /// Tells the other side that this is over, if it would otherwise go on.
     fn cancel(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
         machine.cancel().map_or(Ok(()), |frame| self.send_last(frame))
@@ -166,7 +172,7 @@ impl<'d> Speaking<'d> {
         self.traffic = Traffic { since: Some(Instant::now()), ..Traffic::default() };
         self.take_records(Duration::ZERO, None)?;
         // Nothing new begins after Ctrl-C.
-        if interrupt::requested() {
+        if self.sending.is_interrupted() {
             return Err(self.stopped());
         }
         loop {
@@ -330,7 +336,7 @@ impl<'d> Speaking<'d> {
 
     /// Why nothing more is sent.
     fn stopped(&mut self) -> anyhow::Error {
-        if interrupt::requested() {
+        if self.sending.is_interrupted() {
             return anyhow!("ended by Ctrl-C before it was complete");
         }
         // By then it may be back, and send what was waiting, which nobody expects any more.

@@ -7,6 +7,7 @@ mod answer;
 pub mod calibration;
 #[cfg(test)]
 mod calibration_tests;
+pub mod drive;
 pub mod exchange;
 pub mod lss;
 pub mod node_scan;

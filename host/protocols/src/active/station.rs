@@ -3,6 +3,7 @@
 //! The address is defended as long as the station runs. A message of many frames is received and sent by RTS/CTS, and to all by
 //! BAM.
 
+mod job;
 pub(crate) mod long_message;
 pub(crate) mod parts;
 
@@ -11,11 +12,12 @@ use std::collections::VecDeque;
 use cantap_can::Frame;
 use cantap_trace::Id;
 
+pub use self::job::{GroupAnswer, StationJob, StationTiming};
 use self::long_message::{Incoming, Outgoing};
 pub use self::parts::StationError;
 use self::parts::{CONTROL, DATA, GLOBAL, MS, frame, three};
 use super::{Machine, earlier};
-use crate::j1939::Header;
+use crate::j1939::{Header, fast_frames};
 
 /// After this time, nobody may object to a claim any more (J1939-81).
 const CLAIM_NS: u64 = 250 * MS;
@@ -34,56 +36,6 @@ const TIMED_OUT: u8 = 3;
 /// The NAME's bit for "arbitrary address capable".
 const TAKES_ANY: u64 = 1 << 63;
 
-/// How long a station may take.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct StationTiming {
-    /// How long to wait for the beginning of an answer to a request.
-    pub answer_ns: u64,
-    /// For everything after the address was claimed, however often the other side asks to wait (T4) or for frames again.
-    pub patience_ns: u64,
-}
-
-impl Default for StationTiming {
-    /// 1250 ms, which is T3 of J1939-21 (Tr is 200 ms); one minute.
-    fn default() -> Self {
-        Self { answer_ns: 1250 * MS, patience_ns: 60_000 * MS }
-    }
-}
-
-/// What a station should do with its address.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum StationJob {
-    /// Only claim it.
-    Claim,
-    /// Request a parameter group.
-    Request {
-        /// The group, 18 bits.
-        pgn: u32,
-        /// Who is asked; 255 for all.
-        to: u8,
-    },
-    /// Send a message of up to 1785 bytes.
-    Send {
-        /// The group, 18 bits.
-        pgn: u32,
-        /// The receiver; 255 for all.
-        to: u8,
-        /// 0, the highest, to 7.
-        priority: u8,
-        /// Its bytes.
-        data: Vec<u8>,
-    },
-}
-
-/// A message to this station, or to all, that answers its request.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct GroupAnswer {
-    /// The sender's address.
-    pub from: u8,
-    /// Its bytes.
-    pub data: Vec<u8>,
-}
-
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     New,
@@ -101,6 +53,10 @@ enum Phase {
     Closing,
     /// Sends a message of many frames.
     Sends,
+    /// Its message is due again at this time.
+    Pauses {
+        until_ns: u64,
+    },
     Done,
 }
 
@@ -123,6 +79,8 @@ pub struct Station {
     begun_ns: Option<u64>,
     /// Frames that another node sent from our address.
     imposters: u32,
+    /// Tells one fast packet from the next.
+    counter: u8,
     end: Option<Result<(), StationError>>,
 }
 
@@ -143,6 +101,7 @@ impl Station {
             timing: StationTiming { answer_ns: 1250 * MS, patience_ns: 60_000 * MS },
             begun_ns: None,
             imposters: 0,
+            counter: 0,
             end: None,
         }
     }
@@ -165,6 +124,15 @@ impl Station {
     /// The address that it has or tries to get.
     pub const fn address(&self) -> u8 {
         self.address
+    }
+
+    /// Sends its message again this long after it began to send it, or at once if that time is over. Call it when it is done; until then the
+    /// address is defended.
+    pub fn send_again(&mut self, period_ns: u64) {
+        if self.end == Some(Ok(())) {
+            let begun_ns = self.begun_ns.take().unwrap_or(0);
+            (self.phase, self.end) = (Phase::Pauses { until_ns: begun_ns.saturating_add(period_ns) }, None);
+        }
     }
 
     /// The answers. Call it when it is done.
@@ -225,6 +193,12 @@ impl Station {
             }
             StationJob::Send { pgn, to, priority, data } if data.len() <= 8 => {
                 self.out.push_back(frame(priority, pgn, self.address, to, &data));
+                self.phase = Phase::Closing;
+            }
+            StationJob::SendFast { pgn, to, priority, data } => {
+                let header = Header { priority, pgn, source: self.address, destination: to };
+                self.out.extend(fast_frames(header, self.counter, &data));
+                self.counter = self.counter.wrapping_add(1);
                 self.phase = Phase::Closing;
             }
             StationJob::Send { pgn, to, data, .. } => {
@@ -379,6 +353,7 @@ impl Machine for Station {
                 self.phase = Phase::Claims { until_ns: None };
             }
             Phase::Claims { until_ns: Some(until_ns) } if now_ns >= until_ns => self.phase = Phase::Begins,
+            Phase::Pauses { until_ns } if now_ns >= until_ns => self.phase = Phase::Begins,
             Phase::Waits { .. } | Phase::Sends if self.is_late(now_ns) => self.give_up(),
             Phase::Waits { until_ns: Some(until_ns) }
                 if now_ns >= until_ns && (self.incoming.is_empty() || now_ns >= until_ns + LONGEST_NS) =>
@@ -435,7 +410,7 @@ impl Machine for Station {
             Phase::Waits { until_ns: until_ns @ None } => {
                 *until_ns = Some(now_ns.saturating_add(self.timing.answer_ns));
             }
-            Phase::Closing if self.out.is_empty() => self.done(),
+            Phase::Closing if self.out.is_empty() && self.under_way.is_empty() => self.done(),
             _ => {}
         }
     }
@@ -446,8 +421,10 @@ impl Machine for Station {
             return;
         }
         // Our own frames do not come here.
-        let is_ours =
-            matches!(self.phase, Phase::Begins | Phase::Waits { .. } | Phase::Sends | Phase::Closing);
+        let is_ours = matches!(
+            self.phase,
+            Phase::Begins | Phase::Waits { .. } | Phase::Sends | Phase::Closing | Phase::Pauses { .. }
+        );
         if is_ours && header.source == self.address && header.pgn != CLAIM {
             self.imposters += 1;
             // A node that uses an address without having claimed it is told whose it is (J1939-81).
@@ -489,6 +466,7 @@ impl Machine for Station {
         }
         let own = match self.phase {
             Phase::Claims { until_ns } => until_ns,
+            Phase::Pauses { until_ns } => Some(until_ns),
             Phase::Waits { until_ns } if self.incoming.is_empty() => until_ns,
             Phase::Sends => self.outgoing.as_ref().and_then(Outgoing::due_ns),
             _ => None,

@@ -6,6 +6,7 @@
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB for each of its SDO servers, and the mappings of 512 PDOs.
 
 pub mod codec;
+pub mod drive;
 pub mod eds;
 mod encode;
 mod events;
@@ -129,7 +130,10 @@ impl CanOpen {
                     let code = u16::from_le_bytes([low, high]);
                     let mut event = event(record, EventKind::Emergency, "emergency");
                     event.from = Party::Node(node);
-                    event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
+                    let known = bus.nodes.get(&node).map(|node| node.drive).unwrap_or_default();
+                    let is_drive = known.or_sheet(Self::sheet(sheets, node), node).is_drive();
+                    let meaning = if is_drive { drive::error(code) } else { names::emergency(code) };
+                    event.fields.push(Field::hex("code", code, 4).meaning(Some(meaning)));
                     event
                         .fields
                         .push(Field::hex("register", register, 2).meaning(names::error_register(register)));
@@ -170,12 +174,13 @@ impl CanOpen {
                 let (node, number) = bus.pdo_ids.get(&id).copied().unwrap_or((node, id & 0x780));
                 let entry = bus.nodes.entry(node).or_default();
                 let sheet = Self::sheet(sheets, node);
-                events.push(entry.pdos.event(record, node, number, data, sheet));
+                events.push(entry.pdos.event(record, (node, number), data, sheet, &mut entry.drive));
             }
             _ => {
                 if let Some(&(node, number)) = bus.pdo_ids.get(&id) {
                     let entry = bus.nodes.entry(node).or_default();
-                    events.push(entry.pdos.event(record, node, number, data, Self::sheet(sheets, node)));
+                    let sheet = Self::sheet(sheets, node);
+                    events.push(entry.pdos.event(record, (node, number), data, sheet, &mut entry.drive));
                 }
             }
         }
@@ -241,6 +246,7 @@ impl CanOpen {
                     event.frames = 0;
                     events.push(event);
                 }
+                let drive = node.drive;
                 for (request, sdo) in node.sdos() {
                     let since = sdo.open.as_ref().map(|open| open.time_ns);
                     if since.is_none_or(|since| now_ns.saturating_sub(since) <= sdo::TIMEOUT_NS) {
@@ -250,7 +256,15 @@ impl CanOpen {
                     if let Some(mut transfer) = sdo.end(trouble) {
                         transfer.time_ns = transfer.time_ns.saturating_add(sdo::TIMEOUT_NS);
                         let sheet = Self::sheet(&self.sheets, number);
-                        events.push(transfer_event(&nothing(channel), number, request, transfer, sheet));
+                        let drive = drive.or_sheet(sheet, number);
+                        events.push(transfer_event(
+                            &nothing(channel),
+                            number,
+                            request,
+                            transfer,
+                            sheet,
+                            drive,
+                        ));
                     }
                 }
             }
@@ -294,9 +308,17 @@ impl Assembler for CanOpen {
         for (&channel, bus) in &mut self.buses {
             for (&number, node) in &mut bus.nodes {
                 let sheet = Self::sheet(&self.sheets, number);
+                let drive = node.drive.or_sheet(sheet, number);
                 for (request, sdo) in node.sdos() {
                     if let Some(transfer) = sdo.end(Trouble::Unfinished) {
-                        events.push(transfer_event(&nothing(channel), number, request, transfer, sheet));
+                        events.push(transfer_event(
+                            &nothing(channel),
+                            number,
+                            request,
+                            transfer,
+                            sheet,
+                            drive,
+                        ));
                     }
                 }
             }

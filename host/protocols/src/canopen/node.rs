@@ -2,10 +2,12 @@
 
 use rustc_hash::FxHashMap;
 
+use super::drive::DriveView;
 use super::lss::Lss;
 use super::pdo::Pdos;
 use super::sdo::{Sdo, SdoTransfer};
 use super::sdo_channels::SdoChannels;
+use super::types::number_of;
 
 /// Servers beyond the first that are kept of a node.
 const MOST_SERVERS: usize = 127;
@@ -31,6 +33,7 @@ pub struct Node {
     /// Those beyond the first, by the identifier of their requests.
     further: Vec<(u16, Sdo)>,
     pub pdos: Pdos,
+    pub drive: DriveView,
     pub frames_lost: bool,
 }
 
@@ -89,9 +92,4 @@ pub struct Bus {
     pub lss: Lss,
     pub sync_ns: Option<i64>,
     pub sync_counter: Option<u8>,
-}
-
-/// The number in at most four bytes, least significant first.
-pub fn number_of(bytes: &[u8]) -> u32 {
-    bytes.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }

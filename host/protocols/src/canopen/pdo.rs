@@ -2,8 +2,9 @@
 
 use rustc_hash::FxHashMap;
 
+use super::drive::DriveView;
 use super::eds::Eds;
-use super::{names, sdo, types};
+use super::{drive, names, sdo, types};
 use crate::{Bytes, Event, EventKind, Field, Party, Protocol, Trouble};
 use cantap_trace::TraceRecord;
 
@@ -94,14 +95,15 @@ impl Pdos {
         self.ids.iter().map(|(index, id)| (*id, *index))
     }
 
-    /// A PDO; `number` is its communication parameter, or the predefined identifier without the node.
+    /// A PDO; `number` is its communication parameter, or the predefined identifier without the node. `known` is what is known of the node
+    /// as a drive.
     pub fn event(
         &self,
         record: &TraceRecord,
-        node: u8,
-        number: u16,
+        (node, number): (u8, u16),
         data: &[u8],
         sheet: Option<&Eds>,
+        known: &mut DriveView,
     ) -> Event {
         let parameter = if number >= 0x1400 { number } else { parameter(number) };
         let sends = parameter >= 0x1800;
@@ -134,16 +136,20 @@ impl Pdos {
             if index < 0x20 {
                 continue;
             }
-            let known = sheet.and_then(|eds| eds.entry_of(index, of));
-            let name = known.map(|entry| entry.name.clone()).filter(|name| !name.is_empty());
-            let name = name.or_else(|| names::object(index).map(str::to_owned));
+            known.learn(index, of, bits, &bytes);
+            let drive = known.or_sheet(sheet, node);
+            let entry = sheet.and_then(|eds| eds.entry_of(index, of));
+            let name = entry.map(|entry| entry.name.clone()).filter(|name| !name.is_empty());
+            let of_drive = || drive.is_drive().then(|| names::drive_object(index))?;
+            let name = name.or_else(|| names::object(index).or_else(of_drive).map(str::to_owned));
             let mut field = Field::bytes(name.unwrap_or_else(|| format!("{index:04X}:{of:02X}")), &[]);
-            let data_type = known.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
+            let data_type = entry.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
+            let data_type = data_type.or_else(|| drive.is_drive().then(|| drive::data_type(index))?);
             if types::is_signed(data_type) {
                 extend_sign(&mut bytes, bits);
             }
             field.value = types::value(data_type, &bytes);
-            event.fields.push(field);
+            drive.explain(index, of, &bytes, field, &mut event.fields);
         }
         let rest = cut(data, at, data.len() * 8 - at);
         // Fewer than eight bits fill up the last byte.

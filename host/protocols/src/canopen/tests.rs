@@ -183,7 +183,8 @@ fn pdos_carry_what_was_written_or_what_the_sheet_says() {
     ];
     assert_eq!(
         event_lines(&learned).last().unwrap(),
-        "canopen 5 TPDO1: 6041:00 0x0237, 6064:00 0x12345678, rest 00 00"
+        "canopen 5 TPDO1: statusword 0x0237 (operation enabled), status_flags \"voltage enabled, remote\", \
+         position actual value 305419896, rest 00 00"
     );
     let sheet = "[DeviceInfo]\n[1A00]\nObjectType=9\n[1A00sub0]\nDefaultValue=2\n[1A00sub1]\nDefaultValue=0x60410010\n\
         [1A00sub2]\nDefaultValue=0x60640020\n[6041]\nParameterName=Statusword\nDataType=6\n[6064]\nParameterName=Position\nDataType=4\n";
@@ -192,8 +193,55 @@ fn pdos_carry_what_was_written_or_what_the_sheet_says() {
     let with = CanOpen::new(vec![Sheet { node: None, eds }]);
     assert_eq!(
         testing::event_lines(with, &[(0.0, "185#3702FFFFFFFF")]),
-        ["canopen 5 TPDO1: Statusword 567, Position -1"]
+        [
+            "canopen 5 TPDO1: Statusword 0x0237 (operation enabled), status_flags \"voltage enabled, remote\", Position -1"
+        ]
     );
+}
+
+/// By its words, its device type or its sheet; a node of another profile has other things there.
+#[test]
+fn the_words_of_a_drive_are_states_and_commands() {
+    let talk = [
+        (0.0, "605#2F60600001000000"),
+        (1.0, "585#6060600000000000"),
+        (2.0, "605#2B4060001F000000"),
+        (3.0, "585#6040600000000000"),
+        (4.0, "605#4041600000000000"),
+        (5.0, "585#4B41600037120000"),
+        (6.0, "605#4061600000000000"),
+        (7.0, "585#4F61600001000000"),
+        (8.0, "605#403F600000000000"),
+        (9.0, "585#4B3F600011860000"),
+        (10.0, "085#1186200000000000"),
+        (11.0, "605#4064600000000000"),
+        (12.0, "585#43646000FFFFFFFF"),
+    ];
+    let value = |line: &String| line.split("\"expedited\", ").nth(1).unwrap_or(line).to_owned();
+    let lines: Vec<_> = event_lines(&talk).iter().map(value).collect();
+    assert_eq!(
+        lines,
+        [
+            "value 0x01, after 1 ms",
+            "value 0x001F (enable operation), control_flags \"new set-point\", after 1 ms",
+            "value 0x1237 (operation enabled), status_flags \"voltage enabled, remote, set-point acknowledged\", after 1 ms",
+            "value 1 (profile position), after 1 ms",
+            "value 0x8611 (following error), after 1 ms",
+            "canopen 5 emergency: code 0x8611 (following error), register 0x20 (device profile), manufacturer 00 00 00 00 00",
+            "value -1, after 1 ms",
+        ]
+    );
+    // An input module (CiA 401) has filters there.
+    let other = [
+        (0.0, "605#4000100000000000"),
+        (1.0, "585#4300100091010300"),
+        (2.0, "605#4041600000000000"),
+        (3.0, "585#4B41600037020000"),
+        (4.0, "085#1186200000000000"),
+    ];
+    let lines = event_lines(&other);
+    assert!(lines[1].ends_with("value 0x0237, after 1 ms"), "{lines:?}");
+    assert!(lines[2].contains("0x8611 (reserved)"), "{lines:?}");
 }
 
 #[test]

@@ -4,11 +4,13 @@ use std::borrow::Cow;
 
 use cantap_trace::TraceRecord;
 
+use super::drive::DriveView;
 use super::eds::Eds;
 use super::events::event;
-use super::node::{Bus, number_of};
+use super::node::Bus;
 use super::sdo::SdoTransfer;
-use super::{names, types};
+use super::types::number_of;
+use super::{drive, names, types};
 use crate::{Event, EventKind, Field, Party};
 
 /// A frame of an SDO channel.
@@ -45,9 +47,14 @@ pub fn frame(
             entry.is_period_set = true;
             entry.beat_ns = None;
         }
+        if is_whole {
+            let bits = 8 * transfer.data.len();
+            entry.drive.learn(transfer.index, transfer.sub, bits, &transfer.data);
+        }
         let watched = entry.learn_timeouts(&transfer);
         let lost = !is_whole && std::mem::take(&mut entry.frames_lost);
-        let mut event = transfer_event(record, node, request, transfer, sheet);
+        let drive = entry.drive.or_sheet(sheet, node);
+        let mut event = transfer_event(record, node, request, transfer, sheet, drive);
         event.frames_lost |= lost;
         events.push(event);
         if let Some((watched, ns)) = watched {
@@ -68,6 +75,7 @@ pub fn transfer_event(
     request: Option<u16>,
     transfer: SdoTransfer,
     sheet: Option<&Eds>,
+    drive: DriveView,
 ) -> Event {
     let (verb, kind) =
         if transfer.is_write { ("write", EventKind::SdoWrite) } else { ("read", EventKind::SdoRead) };
@@ -86,7 +94,9 @@ pub fn transfer_event(
         }
         (_, Some(entry)) => Some(entry.name.clone().into()),
         (Some(object), None) => Some(object.name.clone().into()),
-        _ => names::object(transfer.index).map(Cow::Borrowed),
+        _ => names::object(transfer.index)
+            .or_else(|| drive.is_drive().then(|| names::drive_object(transfer.index))?)
+            .map(Cow::Borrowed),
     };
     event.fields.push(Field::hex("index", transfer.index, 4).meaning(name));
     event.fields.push(Field::hex("sub", transfer.sub, 2));
@@ -99,10 +109,11 @@ pub fn transfer_event(
         if !transfer.data.is_empty() || transfer.trouble.is_none() {
             let known = entry
                 .and_then(|entry| entry.data_type)
-                .or_else(|| types::known(transfer.index, transfer.sub));
+                .or_else(|| types::known(transfer.index, transfer.sub))
+                .or_else(|| drive.is_drive().then(|| drive::data_type(transfer.index))?);
             let mut field = Field::bytes("value", &[]);
             field.value = types::value(known, &transfer.data);
-            event.fields.push(field);
+            drive.explain(transfer.index, transfer.sub, &transfer.data, field, &mut event.fields);
         }
     }
     event.data = transfer.data;

@@ -54,3 +54,8 @@ pub const fn known(index: u16, sub: u8) -> Option<u16> {
         _ => return None,
     })
 }
+
+/// The number in at most four bytes, least significant first.
+pub fn number_of(bytes: &[u8]) -> u32 {
+    bytes.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
+}

@@ -37,6 +37,8 @@ pub struct Group {
     pub description: String,
     #[serde(rename = "Type")]
     pub kind: String,
+    /// 0 to 7, where it is known.
+    pub priority: Option<u8>,
     #[serde(default)]
     pub fallback: bool,
     pub fields: Vec<FieldKind>,
@@ -106,6 +108,8 @@ pub struct FieldKind {
     pub bit_offset: Option<usize>,
     #[serde(default)]
     pub bit_length_variable: bool,
+    /// The place of the field that has its length in bits, from 1.
+    pub bit_length_field: Option<usize>,
     pub resolution: Option<f64>,
     #[serde(default)]
     pub signed: bool,
@@ -242,7 +246,7 @@ impl Database {
         self.fallbacks[..before].last().map(|&place| &self.groups[place])
     }
 
-    #[cfg(test)]
+    /// All groups, by number.
     pub fn all(&self) -> &[Group] {
         &self.groups
     }

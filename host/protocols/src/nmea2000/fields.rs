@@ -24,7 +24,7 @@ fn bits(data: &[u8], offset: usize, length: usize) -> Option<u64> {
     Some((number >> (offset % 8)) as u64 & mask(length))
 }
 
-const fn mask(length: usize) -> u64 {
+pub(super) const fn mask(length: usize) -> u64 {
     if length >= 64 { u64::MAX } else { (1 << length) - 1 }
 }
 
@@ -42,8 +42,15 @@ pub fn group(pgn: u32, data: &[u8]) -> Option<&'static Group> {
     of_number.next().or_else(|| database.fallback(pgn))
 }
 
+/// The field of another group, by its place in it, from 1.
+pub(super) fn parameter(pgn: u32, order: usize) -> Option<&'static FieldKind> {
+    // If there are several groups with one number, their first fields, which distinguish them, are alike.
+    let group = Database::get().groups(pgn).iter().find(|group| !group.fallback)?;
+    group.fields.get(order.checked_sub(1)?)
+}
+
 /// Whether the group is one of those that manufacturers define.
-const fn is_proprietary(pgn: u32) -> bool {
+pub(super) const fn is_proprietary(pgn: u32) -> bool {
     matches!(pgn, 0xEF00 | 0x1_EF00 | 0xFF00..=0xFFFF | 0x1_FF00..=0x1_FFFF)
 }
 
@@ -268,17 +275,9 @@ impl Reader<'_> {
 
     /// A value of the parameter named before, with that parameter's length in its own group.
     fn parameter_value(&mut self, name: &'static str, fields: &mut Vec<Field>) {
-        let of = self.about.zip(self.parameter).and_then(|(pgn, order)| {
-            let mut groups = Database::get().groups(pgn).iter().filter(|group| !group.fallback);
-            let (group, other) = (groups.next()?, groups.next());
-            // If there are several groups with one number, their first fields, which distinguish them, are
-            // alike.
-            let group = other.map_or(group, |_| group);
-            Some((group, group.fields.get(order.checked_sub(1)?)?))
-        });
         let left = (self.data.len() * 8).saturating_sub(self.at);
-        match of {
-            Some((_, kind)) if kind.bit_length > 0 && kind.bit_length <= 64 => {
+        match self.about.zip(self.parameter).and_then(|(pgn, order)| parameter(pgn, order)) {
+            Some(kind) if kind.bit_length > 0 && kind.bit_length <= 64 => {
                 let length = kind.bit_length.div_ceil(8) * 8;
                 if length > left {
                     self.at = self.data.len() * 8;
@@ -353,7 +352,7 @@ fn signed(raw: u64, length: usize) -> f64 {
 }
 
 /// A number with its resolution and unit; the highest values of its bits mean that there is none.
-fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
+pub(super) fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
     let length = kind.bit_length;
     if kind.field_type == Kind::Float {
         let value = f32::from_bits(raw as u32);

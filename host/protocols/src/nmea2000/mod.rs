@@ -4,17 +4,23 @@
 //! megabytes that stay allocated.
 
 mod database;
+mod encode;
+mod encode_error;
 mod fields;
 #[cfg(test)]
 mod tests;
+mod values;
+
+pub use encode::{GroupMessage, encode};
+pub use encode_error::EncodeError;
 
 use std::borrow::Cow;
 
 use crate::Field;
 use database::Database;
 
-/// Whether the group is sent as a fast packet.
-pub(crate) fn is_fast(pgn: u32) -> bool {
+/// Whether NMEA 2000 sends the group by fast packet.
+pub fn is_fast(pgn: u32) -> bool {
     // Lower numbers are groups of J1939 and single frames.
     if pgn < 0x1_0000 {
         return false;
@@ -40,7 +46,7 @@ pub(crate) fn name(pgn: u32) -> Option<&'static str> {
 }
 
 /// Whether a group with this number is NMEA 2000's on a bus that has both.
-pub(crate) fn is_own(pgn: u32) -> bool {
+pub fn is_own(pgn: u32) -> bool {
     (0x1_F000..0x2_0000).contains(&pgn) || is_fast(pgn)
 }
 

@@ -168,3 +168,214 @@ fn packets_at_random_are_whole_and_right_or_said_to_be_broken() {
         );
     }
 }
+
+/// A field's value as a text, if a value can be given for it: by number, or by name.
+fn text_of(field: &crate::Field, by_name: bool) -> Option<String> {
+    use crate::Value;
+    let meaning = field.text.as_deref();
+    if matches!(meaning, Some("out of range" | "error" | "cut")) {
+        return None;
+    }
+    match &field.value {
+        Value::Missing => None,
+        Value::Text(text) => Some(text.to_string()).filter(|text| !text.contains('\u{FFFD}')),
+        Value::Bytes(bytes) => Some(hex(bytes)),
+        Value::Hex(number, _) => Some(format!("0x{number:X}")),
+        Value::Number(number) => Some(match meaning.filter(|_| by_name) {
+            Some(name) if values::whole(name).is_none() => name.to_owned(),
+            _ if *number < 0 => number.to_string(),
+            _ => format!("0x{number:X}"),
+        }),
+        Value::Real(number) => Some(match meaning.filter(|_| by_name) {
+            // A date or a time of day, of which there are none from 24 o'clock on.
+            Some(text) if field.unit == "d" || *number < 86400.0 => text.to_owned(),
+            _ => format!("{number} {}", field.unit),
+        }),
+    }
+}
+
+/// Each field with how many of its name there were before, from 1.
+fn numbered(fields: &[crate::Field]) -> Vec<((String, usize), &crate::Field)> {
+    let mut seen = std::collections::HashMap::<String, usize>::new();
+    let mut numbered = Vec::new();
+    for field in fields {
+        let name = values::plain(&field.name);
+        let count = seen.entry(name.clone()).or_default();
+        *count += 1;
+        numbered.push(((name, *count), field));
+    }
+    numbered
+}
+
+/// Encodes what random bytes mean, and reads it back. `None` if it does not fit into a message.
+fn comes_back(group: &'static database::Group, data: &[u8], by_name: bool) -> Option<Vec<u8>> {
+    let mut read = Vec::new();
+    fields::read(group, data, &mut read);
+    let counts: Vec<_> = (1..=group.fields.len())
+        .filter(|order| {
+            [group.set_1_count, group.set_2_count].contains(order)
+                || group.fields.iter().any(|field| field.bit_length_field == Some(*order))
+                || group.fields[order - 1].field_type == Kind::DynamicFieldLength
+                || group.fields[order - 1].wanted.is_some()
+        })
+        .map(|order| values::plain(&group.fields[order - 1].name))
+        .collect();
+    let (mut given, mut cut) = (Vec::new(), false);
+    for ((name, number), field) in numbered(&read) {
+        if !counts.contains(&name)
+            && let Some(text) = text_of(field, by_name)
+        {
+            given.push((format!("{name}_{number}"), text));
+        }
+    }
+    let written = loop {
+        let pairs: Vec<_> = given.iter().map(|(name, text)| (name.as_str(), text.as_str())).collect();
+        match encode::encode_as(group, &pairs) {
+            Ok(written) => break written,
+            Err(EncodeError::TooLong { .. }) => return None,
+            // Random bytes may say that a key's value is longer than the key has it.
+            Err(EncodeError::Value { .. })
+                if group.fields.iter().any(|field| field.field_type == Kind::DynamicFieldValue) =>
+            {
+                return None;
+            }
+            Err(EncodeError::Needed { fields }) => {
+                given.splice(0..0, fields.into_iter().map(|name| (name, "0".to_owned())));
+            }
+            // Bytes that the end of the data has cut.
+            Err(EncodeError::Value { text, .. }) if given.last().is_some_and(|(_, last)| *last == text) => {
+                given.pop();
+                cut = true;
+            }
+            Err(error) => panic!("{} {}: {error}; {given:?}", group.pgn, group.description),
+        }
+    };
+    let mut back = Vec::new();
+    fields::read(group, &written, &mut back);
+    let back = numbered(&back);
+    let last = read.len() - usize::from(cut);
+    for (place, field) in numbered(&read[..last]) {
+        if counts.contains(&place.0) || text_of(field, by_name).is_none() {
+            continue;
+        }
+        let same = back.iter().find(|(other, _)| *other == place);
+        let is_same =
+            same.is_some_and(|(_, other)| match (field.value.as_number(), other.value.as_number()) {
+                (Some(one), Some(other)) if one != other => {
+                    (one - other).abs() <= 1e-9 * one.abs() || by_name
+                }
+                _ => {
+                    field.text == other.text
+                        && (field.value == other.value || by_name || field.value.as_number().is_some())
+                }
+            });
+        assert!(is_same, "{} {}: {field} came back as {same:?}", group.pgn, group.description);
+    }
+    Some(written)
+}
+
+/// A position as canboat's own sample of it, values by name with and without units, and what is not given.
+#[test]
+fn values_by_name_become_the_bytes_of_their_group() {
+    let made =
+        encode("position, rapid update", &[("latitude", "37.9220534"), ("Longitude", "23.016909 deg")]);
+    assert_eq!(
+        made,
+        Ok(GroupMessage {
+            pgn: 129_025,
+            name: "Position, Rapid Update",
+            priority: Some(2),
+            data: vec![0x36, 0x72, 0x9A, 0x16, 0x02, 0x1A, 0xB8, 0x0D],
+        })
+    );
+    let bytes = |group: &str, values: &[(&str, &str)]| encode(group, values).map(|made| hex(&made.data));
+    assert_eq!(
+        bytes("130306", &[("wind_speed", "6.0 m/s"), ("Reference", "apparent")]).as_deref(),
+        Ok("FF5802FFFFFAFFFF")
+    );
+    // Repeated fields are counted, a date is a date, a time a time.
+    let values = [
+        ("Date", "2026-11-30"),
+        ("Time", "12:00:00.5"),
+        ("GNSS type", "GPS"),
+        ("Method", "GNSS fix"),
+        ("Integrity", "0"),
+        ("Reference Station ID_2", "7"),
+    ];
+    let position = encode("GNSS Position Data", &values).unwrap();
+    let mut fields = Vec::new();
+    describe(position.pgn, &position.data, &mut fields);
+    let fields: Vec<_> = fields.iter().map(ToString::to_string).collect();
+    let said = fields.join(", ");
+    assert!(
+        said.starts_with("SID not available, Date 20787 d (2026-11-30), Time 43200.5 s (12:00:00.5), Latitude not available, "),
+        "{said}"
+    );
+    assert!(
+        said.contains("GNSS type 0 (GPS), Method 1 (GNSS fix), ")
+            && said.contains("Reference Stations 2, ")
+            && said.ends_with("Reference Station ID 7, Age of DGNSS Corrections not available"),
+        "{said}"
+    );
+    assert_eq!(position.data.len(), 43 + 8);
+    // The length of a key's value is the key's.
+    let keys = encode(
+        "B&G: key-value data",
+        &[("Key", "Wind Direction"), ("Value", "1.5 rad"), ("Key_2", "0xFFF"), ("Value_2", "0102")],
+    );
+    let keys = keys.unwrap();
+    let mut fields = Vec::new();
+    describe(keys.pgn, &keys.data, &mut fields);
+    let said: Vec<_> = fields.iter().skip(2).map(ToString::to_string).collect();
+    assert!(said[0].ends_with("(Wind Direction)"), "{said:?}");
+    assert_eq!(said[1..3], ["Length 2 bytes", "Value 1.5 rad"]);
+    assert_eq!(said[3..], ["Key 4095", "Length 2 bytes", "Value 01 02"]);
+    let text = |group: &str, values: &[(&str, &str)]| encode(group, values).unwrap_err().to_string();
+    for (group, values, expected) in [
+        ("positon", &[][..], "CANboat's database has no group 'positon'"),
+        ("Rapid Update", &[], "CANboat's database has no group 'Rapid Update'; there are "),
+        (
+            "129025",
+            &[("depth", "1")],
+            "Position, Rapid Update has no field 'depth'; it has Latitude, Longitude",
+        ),
+        ("129025", &[("latitude", "90.1")], "Latitude cannot be '90.1': it is from -90 to 90 deg"),
+        ("129025", &[("latitude", "1 rad")], "Latitude cannot be '1 rad': it is a number in deg"),
+        ("129025", &[("latitude_2", "1")], "Position, Rapid Update has no field 'latitude_2'"),
+        ("130306", &[("reference", "north")], "Reference cannot be 'north': it is a number, or one of: "),
+        ("129029", &[("number_of_svs", "253")], "Number of SVs cannot be '253': it is from 0 to 252"),
+        ("129029", &[("date", "1969-12-31")], "Date cannot be '1969-12-31': it is from 0 to 65532 d"),
+        ("126720", &[], "'126720' is one of several groups; name one: "),
+    ] {
+        let said = text(group, values);
+        assert!(said.starts_with(expected), "{said}");
+    }
+    let needed = text("GNSS Position Data", &[]);
+    assert!(
+        needed.starts_with("GNSS type, Method, Integrity have no value for")
+            || needed.starts_with("Integrity has no value for"),
+        "{needed}"
+    );
+}
+
+/// What random bytes mean in every group of the database, given as texts, is read back the same.
+#[test]
+fn random_values_of_every_group_come_back() {
+    let mut random = fastrand::Rng::with_seed(2002);
+    let (mut groups, mut messages) = (0, 0);
+    for group in Database::get().all().iter().filter(|group| !group.fallback) {
+        let mut whole = 0;
+        for round in 0..40 {
+            let length = random.usize(0..if round % 2 == 0 { 60 } else { 200 });
+            let byte = |random: &mut fastrand::Rng| {
+                if random.bool() { random.u8(b' '..b'~') } else { random.u8(..) }
+            };
+            let data: Vec<u8> = (0..length).map(|_| byte(&mut random)).collect();
+            whole += usize::from(comes_back(group, &data, round % 3 == 0).is_some());
+        }
+        assert!(whole > 0, "{} {}", group.pgn, group.description);
+        groups += 1;
+        messages += whole;
+    }
+    assert!(groups == 535 && messages > 20_000, "{groups} {messages}");
+}

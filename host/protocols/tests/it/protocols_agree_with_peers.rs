@@ -7,10 +7,11 @@
 
 use cantap_testing::peers;
 
-use std::io::Read;
+use std::io::{Read, Write as _};
 use std::process::Command;
 
 use cantap_protocols::canopen::eds::{self, Eds};
+use cantap_protocols::j1939::{Header, fast_frames};
 use cantap_protocols::{
     Announcement, Event, EventKind, Evidence, Options, Party, Protocol, ReadItem, Reader, Value,
 };
@@ -352,4 +353,102 @@ fn parameter_groups_have_the_names_that_canmatrix_and_can_j1939_give_them() {
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     // All of ours: DM1 to DM57 without DM9, which can-j1939 does not have; the others without those of the protocol itself.
     assert_eq!((acronyms, messages), (52, 56));
+}
+
+/// Values by name become frames, single or fast packets, and canboat's decoder reads the values from them.
+#[test]
+fn canboat_reads_what_we_send_by_name() {
+    const SENT: [(&str, &[(&str, &str)]); 12] = [
+        ("Position, Rapid Update", &[("Latitude", "54.3212345 deg"), ("Longitude", "-10.1")]),
+        ("COG & SOG, Rapid Update", &[("COG Reference", "True"), ("COG", "1.5708 rad"), ("SOG", "3.21")]),
+        ("Wind Data", &[("Wind Speed", "6 m/s"), ("Wind Angle", "0.5235"), ("Reference", "Apparent")]),
+        ("Water Depth", &[("Depth", "8.51"), ("Offset", "-0.5")]),
+        ("Vessel Heading", &[("Heading", "3.1"), ("Variation", "-0.05"), ("Reference", "Magnetic")]),
+        ("Rudder", &[("Instance", "0"), ("Direction Order", "0"), ("Position", "-0.1")]),
+        (
+            "Engine Parameters, Rapid Update",
+            &[("Instance", "0"), ("Speed", "1800.25 rpm"), ("Tilt/Trim", "-3")],
+        ),
+        (
+            "Engine Parameters, Dynamic",
+            &[
+                ("Instance", "1"),
+                ("Oil pressure", "350000"),
+                ("Temperature", "358.15 K"),
+                ("Alternator Potential", "14.1"),
+                ("Total Engine hours", "720000"),
+                ("Discrete Status 1", "Over Temperature, Low Oil Pressure"),
+                ("Engine Load", "60"),
+            ],
+        ),
+        ("Fluid Level", &[("Instance", "2"), ("Type", "Fuel"), ("Level", "75.5 %"), ("Capacity", "120")]),
+        (
+            "GNSS Position Data",
+            &[
+                ("SID", "7"),
+                ("Date", "2026-11-30"),
+                ("Time", "12:34:56.5"),
+                ("Latitude", "54.32123456789"),
+                ("Longitude", "10.1"),
+                ("Altitude", "2.5"),
+                ("GNSS type", "GPS"),
+                ("Method", "GNSS fix"),
+                ("Integrity", "No integrity checking"),
+                ("Number of SVs", "9"),
+                ("HDOP", "0.9"),
+            ],
+        ),
+        (
+            "Product Information",
+            &[
+                ("NMEA 2000 Version", "2.1"),
+                ("Product Code", "42"),
+                ("Model ID", "cantap boat"),
+                ("Software Version Code", "1.0"),
+                ("Model Version", "1"),
+                ("Model Serial Code", "4711"),
+                ("Certification Level", "Level B"),
+                ("Load Equivalency", "1"),
+            ],
+        ),
+        ("System Time", &[("Source", "GPS"), ("Date", "2026-11-30"), ("Time", "01:02:03")]),
+    ];
+    let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("sent.log.gz");
+    let (mut records, mut log) = (Vec::new(), String::new());
+    for (counter, (group, values)) in (0_u8..).zip(SENT) {
+        let made = cantap_protocols::nmea2000::encode(group, values).unwrap();
+        let priority = made.priority.unwrap_or(6);
+        let header = Header { priority, pgn: made.pgn, source: 35, destination: 255 };
+        let frames = if cantap_protocols::nmea2000::is_fast(made.pgn) {
+            fast_frames(header, counter, &made.data)
+        } else {
+            vec![cantap_can::Frame::data_frame(header.id(), &made.data).unwrap()]
+        };
+        for frame in frames {
+            let time_ns = 1_000_000 * records.len() as i64;
+            log += &format!("({:.6}) can0 {frame}\n", time_ns as f64 / 1e9);
+            records.push(record(time_ns, &frame.to_string()));
+        }
+    }
+    let mut file =
+        flate2::write::GzEncoder::new(std::fs::File::create(&path).unwrap(), flate2::Compression::fast());
+    file.write_all(log.as_bytes()).unwrap();
+    file.finish().unwrap();
+    let Some(text) = peer("nmea2000", &["nmea2000", path.to_str().unwrap()]) else { return };
+    let theirs: Vec<serde_json::Value> =
+        text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let ours = events(&records, &[Protocol::Nmea2000]);
+    assert_eq!((ours.len(), theirs.len()), (SENT.len(), SENT.len()));
+    let mut fields = 0;
+    for ((our, their), (group, values)) in ours.iter().zip(&theirs).zip(SENT) {
+        assert_eq!((&*our.title, their["title"].as_str()), (group, Some(group)));
+        let wrong = differences(our, their, &mut fields);
+        assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+        // Whatever was given is a value for both.
+        for (name, text) in values {
+            let field = our.field(name).unwrap_or_else(|| panic!("{group}: {name}"));
+            assert!(field.value != Value::Missing, "{group}: {name} {text}: {field}");
+        }
+    }
+    assert!(fields > 80, "{fields}");
 }

@@ -274,3 +274,30 @@ fn a_connection_that_is_ended_from_outside_is_aborted() {
     station.hear(2, asks.id(), asks.data());
     assert_eq!(station.cancel().unwrap().to_string(), "1CEC0380#FF02FFFFFFCAFE00");
 }
+
+/// Each has its own counter, the pause counts from one beginning to the next, and the address is defended meanwhile.
+#[test]
+fn a_fast_packet_is_sent_again_and_again_with_the_next_counter() {
+    let data = bytes(20);
+    let job = StationJob::SendFast { pgn: 0x1_F805, to: GLOBAL, priority: 3, data: data.clone() };
+    let mut station = Station::with_address(NAME, 0x80, job);
+    let mut peer = nobody();
+    let (first_ns, sent) = run(&mut station, &mut peer, arrives);
+    assert_eq!(first_ns, 1 + 3 * crate::active::testing::FRAME_NS);
+    let texts: Vec<_> = sent.iter().map(ToString::to_string).collect();
+    assert_eq!(
+        texts,
+        ["0DF80580#00140104070A0D10", "0DF80580#011316191C1F2225", "0DF80580#02282B2E3134373A"]
+    );
+    station.send_again(100 * MS);
+    assert!(!station.is_done() && station.due_ns() == Some(1 + 100 * MS));
+    // Somebody asks for it meanwhile.
+    station.hear(50 * MS, frame(6, REQUEST, 3, GLOBAL, &three(CLAIM)).id(), &three(CLAIM));
+    assert_eq!(station.next(50 * MS).unwrap().to_string(), "18EEFF80#0500000000000080");
+    station.sent(50 * MS);
+    assert_eq!(station.next(99 * MS), None);
+    let frames: Vec<_> = std::iter::from_fn(|| station.next(101 * MS)).collect();
+    assert_eq!(frames.iter().map(|frame| frame.data()[0]).collect::<Vec<_>>(), [0x20, 0x21, 0x22]);
+    (0..3).for_each(|_| station.sent(102 * MS));
+    assert!(station.is_done() && station.finish() == Ok(vec![]));
+}

@@ -35,7 +35,7 @@ pub enum Protocol {
 
 impl Protocol {
     /// All of them.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 12] = [
         Self::IsoTp,
         Self::Uds,
         Self::Kwp2000,

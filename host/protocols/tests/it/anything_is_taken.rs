@@ -114,7 +114,7 @@ fn resident() -> usize {
 type Beginning = fn(u32) -> (Id, Vec<u8>);
 
 #[cfg(target_os = "linux")]
-const BEGINNINGS: [(&str, &[Protocol], Beginning); 9] = [
+const BEGINNINGS: [(&str, &[Protocol], Beginning); 12] = [
     ("ISO-TP, 11 bits", &[Protocol::IsoTp], |at| {
         (Id::standard_truncated(at), vec![0x1F, 0xFF, 0x62, 1, 2, 3, 4, 5])
     }),

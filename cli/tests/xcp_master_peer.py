@@ -10,8 +10,7 @@ import time
 
 from pyxcp.config import create_application_from_config
 from pyxcp.master import Master
-from pyxcp.transport.base import FrameAcquisitionPolicy
-from pyxcp.types import FrameCategory, XcpResponseError
+from pyxcp.transport.transport_ext import FrameAcquisitionPolicy, FrameCategory
 
 MEASURED, PARAMETERS = 0x2000_0000, 0x3000_0000
 
@@ -31,13 +30,9 @@ class Collect(FrameAcquisitionPolicy):
         pass
 
 
-def attempt(action, *arguments):
+def attempt(master, action, *arguments):
     """The name of the error that an action ends with."""
-    try:
-        action(*arguments)
-        return None
-    except XcpResponseError as error:
-        return str(error.get_error_code()).rpartition(".")[2]
+    return str(master.try_command(action, *arguments)[1].error_code)
 
 
 def main(host, port):
@@ -62,8 +57,8 @@ def main(host, port):
         master.download(bytes([0xA0, 0x0F]), last=True)
         said["written"] = list(master.shortUpload(2, PARAMETERS))
         said["refused"] = [
-            attempt(master.shortUpload, 4, 0x1000),
-            attempt(master.setDaqPtr, 7, 0, 0),
+            attempt(master, master.shortUpload, 4, 0x1000),
+            attempt(master, master.setDaqPtr, 7, 0, 0),
         ]
         info = master.getDaqInfo()
         said["events"] = [channel["name"] for channel in info["channels"]]

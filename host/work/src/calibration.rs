@@ -12,6 +12,8 @@ use cantap_protocols::xcp::codec::{self as xcp, command};
 
 use crate::speaking::Speaking;
 
+/// Bytes of a frame: commands are sent in classical ones, whatever the slave has room for.
+const MOST_FRAME: usize = 8;
 /// Most bytes that are read with one name or address.
 pub const MOST_READ: u32 = 1 << 16;
 
@@ -206,6 +208,8 @@ impl<'d> Master<'d> {
             return Ok(());
         }
         let answer = self.ask(vec![command::CONNECT, 0], 0, true)?;
+        // Whatever it says, it is to be disconnected.
+        self.connected = Some(Connected { order: ByteOrder::Little, max_cto: 8, max_dto: 8 });
         let &[_, mode, max_cto, first, second, protocol, transport, ..] = &answer[..] else {
             bail!("the ECU's answer to CONNECT has {} bytes; it has to have 7", answer.len());
         };
@@ -288,7 +292,7 @@ impl<'d> Master<'d> {
     /// The slave does not answer or refuses.
     pub fn read(&mut self, extension: u8, address: u32, length: u32) -> anyhow::Result<Vec<u8>> {
         ensure!(length <= MOST_READ, "at most {MOST_READ} bytes are read at once");
-        let step = if self.is_ccp() { 5 } else { self.state()?.max_cto.min(64) - 1 };
+        let step = if self.is_ccp() { 5 } else { self.state()?.max_cto.min(MOST_FRAME) - 1 };
         let mut data = Vec::new();
         while data.len() < length as usize {
             let at = address.checked_add(data.len() as u32).context("it is beyond the last address")?;
@@ -319,7 +323,7 @@ impl<'d> Master<'d> {
             }
         } else {
             self.ask([&[command::SET_MTA, 0, 0, extension][..], &place].concat(), 0, true)?;
-            for part in bytes.chunks(self.state()?.max_cto.min(64) - 2) {
+            for part in bytes.chunks(self.state()?.max_cto.min(MOST_FRAME) - 2) {
                 self.ask([&[command::DOWNLOAD, part.len() as u8][..], part].concat(), 0, false)?;
             }
         }
@@ -365,7 +369,7 @@ impl<'d> Master<'d> {
         ensure!((1..=255).contains(&key.len()), "a key has 1 to 255 bytes");
         let mut left = key;
         while !left.is_empty() {
-            let part = &left[..left.len().min(self.state()?.max_cto.min(64) - 2)];
+            let part = &left[..left.len().min(self.state()?.max_cto.min(MOST_FRAME) - 2)];
             self.ask([&[command::UNLOCK, left.len() as u8][..], part].concat(), 0, false)?;
             left = &left[part.len()..];
         }
@@ -393,13 +397,13 @@ impl<'d> Master<'d> {
             events.max(1) - 1
         );
         let has_stamps = properties & 0x10 != 0;
-        let (mut stamp, mut largest) = (0, state.max_dto.min(64) - 1);
+        let (mut stamp, mut largest) = (0, state.max_dto.min(MOST_FRAME) - 1);
         if let Ok(resolution) = self.ask_whether(vec![command::GET_DAQ_RESOLUTION_INFO], 0, true)? {
             largest = resolution.get(1).map_or(largest, |size| usize::from(*size).min(largest)).max(1);
             let mode = resolution.get(4).copied().unwrap_or_default();
             stamp = if has_stamps { usize::from(mode & 7) } else { 0 };
         }
-        let packets = packets(values, stamp, state.max_dto.min(64) - 1, largest)?;
+        let packets = packets(values, stamp, state.max_dto.min(MOST_FRAME) - 1, largest)?;
         let daq = u16::from(predefined);
         let list = self.number(daq.into(), 2);
         self.ask(vec![command::FREE_DAQ], 0, true)?;

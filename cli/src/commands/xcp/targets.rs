@@ -167,7 +167,7 @@ impl Target {
 
     /// Whether it can be in a list.
     pub fn check_sampled(&self) -> anyhow::Result<()> {
-        if self.step > 63 {
+        if self.step > 7 {
             return Err(usage(format!(
                 "{} has {} bytes, and has no room in a frame; use poll",
                 self.text, self.step

@@ -98,6 +98,9 @@ pub enum CommandError {
         "another master sends with the same identifier at the same time; the answers may be to its commands"
     )]
     OtherMaster,
+    /// The command has more bytes than a frame.
+    #[error("the command is longer than a frame")]
+    TooLong,
     /// Frames from the bus were lost on the way to this computer.
     #[error("frames were lost on the way to this computer, the answer perhaps among them")]
     FramesLost,
@@ -307,6 +310,9 @@ impl Machine for CalibrationCommand {
             }
             _ => return None,
         };
+        if frame.is_none() && self.end.is_none() {
+            self.fail(CommandError::TooLong);
+        }
         self.under_way += usize::from(frame.is_some());
         frame
     }

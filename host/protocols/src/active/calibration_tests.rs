@@ -94,6 +94,12 @@ fn busy_and_pending_slaves_are_waited_for_and_not_for_ever() {
 }
 
 #[test]
+fn a_command_that_is_no_frame_ends_at_once() {
+    let (answer, sent) = outcome(request(XCP, &[0; 9], 0), Vec::new());
+    assert_eq!((answer, sent.len()), (Err(CommandError::TooLong), 0));
+}
+
+#[test]
 fn another_master_is_noticed() {
     let mut machine = CalibrationCommand::new(request(XCP, &[0xFD], 0));
     use super::Machine as _;

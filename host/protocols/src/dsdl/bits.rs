@@ -123,7 +123,7 @@ mod tests {
             (0xC000, -2.0),
             (0x8001, -5.960_464_5e-8),
         ] {
-            assert_eq!(half(bits), value, "{bits:04X}");
+            assert_eq!(half(bits).to_bits(), f32::to_bits(value), "{bits:04X}");
         }
         assert!(half(0x7E00).is_nan());
     }

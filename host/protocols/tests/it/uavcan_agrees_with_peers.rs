@@ -44,7 +44,7 @@ fn events(protocol: Protocol, types: Arc<DataTypes>, transfer: &serde_json::Valu
 
 /// Whether our value is theirs.
 fn is_same(ours: &Value, kind: &str, theirs: &serde_json::Value) -> bool {
-    let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02X}")).collect::<String>();
+    let hex = |bytes: &[u8]| bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
     match (kind, ours) {
         ("int", Value::Number(ours)) => theirs.as_i64() == Some(*ours),
         ("int", Value::Hex(ours, _)) => theirs.as_u64() == Some(*ours),
@@ -52,7 +52,7 @@ fn is_same(ours: &Value, kind: &str, theirs: &serde_json::Value) -> bool {
         ("float", Value::Real(ours)) => {
             let theirs: f64 = theirs.as_str().unwrap().parse().unwrap();
             // Ours has the fewest digits that a float of 32 bits needs.
-            *ours == theirs || *ours as f32 == theirs as f32
+            ours.to_bits() == theirs.to_bits() || (*ours as f32).to_bits() == (theirs as f32).to_bits()
         }
         ("bytes", Value::Bytes(ours)) => theirs.as_str() == Some(&hex(ours)),
         ("bytes", Value::Text(ours)) => theirs.as_str() == Some(&hex(ours.as_bytes())),

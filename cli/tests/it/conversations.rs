@@ -189,7 +189,12 @@ fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
     let log = "(1.0) can0 705#00\n(1.1) can0 185#3702\n(1.2) can0 186#3702\n";
     let (code, out, err) = cantap("conversations_sheet", log, &["--eds", "5:drive.eds"]);
     assert_eq!(code, Some(0), "{err}");
-    assert!(out.contains("TPDO1: Statusword 567\n") && out.contains("TPDO1: data 37 02\n"), "{out}");
+    assert!(
+        out.contains(
+            "TPDO1: Statusword 0x0237 (operation enabled), status_flags \"voltage enabled, remote\"\n"
+        ) && out.contains("TPDO1: data 37 02\n"),
+        "{out}"
+    );
     assert!(err.contains("drive.eds: line 11: neither a section nor a key: rubbish"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "bus.log"]);
     assert!(code == Some(1) && err.contains("is not an EDS or DCF"), "{err}");

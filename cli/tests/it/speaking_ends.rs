@@ -15,7 +15,7 @@ use served::Served;
 
 const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
 /// Nobody answers, so each of them is in the middle of something for as long as its options say.
-const WAITING: [&str; 12] = [
+const WAITING: [&str; 13] = [
     "uds --p2 50s read F190",
     "uds --p2 50s --session extended --security 1 --key-command true tester-present",
     "uds --p2 50s routine start FF00",
@@ -26,15 +26,17 @@ const WAITING: [&str; 12] = [
     "canopen --timeout 50s scan 20-30",
     "canopen scan --listen 50s",
     "canopen --timeout 50s lss --node 5",
+    "canopen --timeout 50s drive 5 enable --yes",
     "j1939 request 65260",
     "j1939 send 0xD000 BIG",
 ];
 /// These go on until they are told to end.
-const REPEATING: [&str; 4] = [
+const REPEATING: [&str; 5] = [
     "uds tester-present --period 30ms",
     "canopen sync --period 30ms",
     "canopen heartbeat 7 --period 30ms",
     "canopen monitor",
+    "j1939 send 130306 Reference=2 --period 30ms",
 ];
 /// Longer than any of them takes once it is disturbed, on a busy machine. Most of them would wait for longer.
 const SOON: Duration = Duration::from_secs(20);
@@ -195,7 +197,7 @@ fn nothing_is_sent_after_the_end() {
     let log = std::fs::read_to_string(&log).unwrap();
     let frames = frames_of(&log);
     let of = |id: &str| frames.iter().filter(|frame| frame.starts_with(id)).count();
-    assert!(of("7E0#") >= 4 && of("080#") >= 4 && of("707#") >= 4, "{log}");
+    assert!(of("7E0#") >= 4 && of("080#") >= 4 && of("707#") >= 4 && of("09FD02F9#") >= 2, "{log}");
     assert_eq!(frames.last(), Some(&"7FF#"), "{log}");
     // After the first mark comes the second round, which begins with the session of a new client.
     assert_eq!(of("7FF#"), 2, "{log}");

@@ -286,7 +286,8 @@ impl<'s, 'd> Drive<'s, 'd> {
             _ => self.stop(),
         };
         interrupt::before_the_end(None);
-        let told = self.pass_on();
+        // Of a drive that has not answered, nothing is known.
+        let told = if self.client.values().statusword.is_some() { self.pass_on() } else { Ok(()) };
         let node = self.node;
         match (done, left) {
             (Ok(done), Ok(left)) => told.map(|()| format!("node {node}: {done}; {left}")),

@@ -358,6 +358,57 @@ fn values_by_name_become_the_bytes_of_their_group() {
     );
 }
 
+/// Whatever a user writes for a field is a value, or refused with a reason.
+#[test]
+fn any_texts_are_taken_as_values() {
+    let mut random = fastrand::Rng::with_seed(2003);
+    let words = [
+        "",
+        "-",
+        "0x",
+        "0xFFFFFFFFFFFFFFFF",
+        "-1",
+        "1e300",
+        "NaN",
+        "inf",
+        "99999999999999999999",
+        "2026-02-30",
+        "25:00",
+        "12:60",
+        ":",
+        "9999-12-31",
+        "bit 70",
+        "bit 3, bit 63",
+        "00",
+        "0G",
+        "é",
+        "On",
+        "1.5 rad",
+        "0102",
+        "_",
+        "\u{0}",
+    ];
+    let (mut made, mut refused) = (0, 0);
+    for group in Database::get().all() {
+        for _ in 0..10 {
+            let fields: Vec<_> = group.fields.iter().filter(|_| random.u8(..) < 90).collect();
+            let values: Vec<_> =
+                fields.iter().map(|field| (field.name.as_str(), random.choice(words).unwrap())).collect();
+            match encode::encode_as(group, &values) {
+                Ok(data) => {
+                    made += 1;
+                    fields::read(group, &data, &mut Vec::new());
+                }
+                Err(error) => {
+                    refused += 1;
+                    assert!(error.to_string().len() > 10);
+                }
+            }
+        }
+    }
+    assert!(made > 100 && refused > 100, "{made} {refused}");
+}
+
 /// What random bytes mean in every group of the database, given as texts, is read back the same.
 #[test]
 fn random_values_of_every_group_come_back() {

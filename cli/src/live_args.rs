@@ -72,5 +72,20 @@ pub const AUTO_NEEDS_A_DEVICE: &str = "-b auto listens to a device, and a trace 
 
 /// An error about a device that nobody named: it says why one is needed.
 pub fn for_listening(error: anyhow::Error, given: &[Address], without: &str) -> anyhow::Error {
-    if given.is_empty() { error.context(format!("{without}, a device is listened to")) } else { error }
+    if !given.is_empty() {
+        return error;
+    }
+    let pipe = if is_piped() { " (what comes through a pipe is read with - for its name)" } else { "" };
+    error.context(format!("{without}{pipe}, a device is listened to"))
+}
+
+/// Whether standard input is another program's output.
+fn is_piped() -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        std::fs::metadata("/dev/stdin").is_ok_and(|input| input.file_type().is_fifo())
+    }
+    #[cfg(not(unix))]
+    false
 }

@@ -29,6 +29,7 @@ mod completion;
 mod database_args;
 mod exit;
 mod fd_frames;
+mod habits;
 mod input;
 mod key_command;
 mod keyboard;
@@ -51,12 +52,12 @@ mod vocabulary;
 
 use std::alloc::System;
 use std::error::Error;
-use std::path::Path;
+use std::ffi::OsString;
 use std::process::ExitCode;
 
 use cantap_scripts::Counting;
 use cantap_work::interrupt;
-use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, FromArgMatches, Parser};
 use clap_complete::CompleteEnv;
 
@@ -84,17 +85,17 @@ fn main() -> ExitCode {
     let arguments = commands::extcap::arguments(std::env::args_os());
     let line = commands::help::grouped(Cli::command());
     let command = arguments.get(1).and_then(|name| line.find_subcommand(name)).cloned();
-    let parsed = line.clone().try_get_matches_from(arguments);
+    let parsed = line.clone().try_get_matches_from(arguments.iter());
     let cli = parsed
         .and_then(|matches| Cli::from_arg_matches(&matches))
-        .unwrap_or_else(|error| leave(error, command.as_ref()));
+        .unwrap_or_else(|error| leave(error, command.as_ref(), &arguments));
     let ends_by_itself = cli.command.ends_by_itself();
     match cli.command.run(line) {
         Ok(code) => code,
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cantap: {}", cantap_work::advice::sentence(&error));
+            eprintln!("cantap: {}{}", cantap_work::advice::sentence(&error), habits::also(&error));
             ExitCode::from(match error {
                 error if is_usage_error(&error) => exit::WRONG_COMMAND_LINE,
                 _ if ends_by_itself && interrupt::requested() => interrupt::ENDED_BY_SIGNAL,
@@ -106,21 +107,15 @@ fn main() -> ExitCode {
 
 /// The command line is wrong, or requests help. A device's options are a language of their own: an error in one is reported like an
 /// error in a condition, on one line.
-fn leave(mut error: clap::Error, command: Option<&clap::Command>) -> ! {
+fn leave(mut error: clap::Error, command: Option<&clap::Command>, arguments: &[OsString]) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());
     if let Some(address @ cantap_address::AddressError::Option { .. }) = address {
         eprintln!("cantap: {address}");
         std::process::exit(exit::WRONG_COMMAND_LINE.into());
     }
-    // Some commands take a device without -d.
-    let takes_device =
-        command.is_some_and(|command| command.get_arguments().any(|arg| arg.get_short() == Some('d')));
-    if let Some(ContextValue::String(text)) = error.get(ContextKind::InvalidArg)
-        && takes_device
-        && error.kind() == ErrorKind::UnknownArgument
-        && cantap_address::Address::is_meant_by(Path::new(text))
-    {
-        let advice = format!("a device is given with -d, as in: -d {text}");
+    if let Some(advice) = habits::advice(&error, command, arguments) {
+        // A command that is only spelled alike would mislead.
+        error.remove(ContextKind::SuggestedSubcommand);
         error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![advice.into()]));
     }
     error.exit()

@@ -47,7 +47,10 @@ impl Screen {
     /// Takes over the terminal; if there is none, the error says what to do instead.
     pub fn enter() -> anyhow::Result<Self> {
         const INSTEAD: &str = "use --once for one screen, or `cantap capture` and `cantap stats`";
-        if !std::io::stdout().is_terminal() || !std::io::stdin().is_terminal() {
+        // Where standard input is a trace (`candump can0 | cantap monitor - -b 500k`), keys come from the terminal itself.
+        let has_keys =
+            || std::io::stdin().is_terminal() || cfg!(unix) && std::fs::File::open("/dev/tty").is_ok();
+        if !std::io::stdout().is_terminal() || !has_keys() {
             bail!("the live view needs a terminal; {INSTEAD}");
         }
         if cfg!(unix) && matches!(std::env::var("TERM").as_deref(), Ok("" | "dumb")) {

@@ -149,7 +149,8 @@ fn wrapped(text: &str, columns: usize) -> String {
 pub fn run(args: &Args, line: &clap::Command) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     if let [word] = &args.words[..]
-        && let Some((_, _, text)) = TOPICS.iter().find(|(name, ..)| name == word)
+        && let Some((_, _, text)) =
+            TOPICS.iter().find(|(name, ..)| name == word || name.strip_suffix('s') == Some(word))
     {
         out.write_all(wrapped(text, columns()).as_bytes())?;
         return Ok(ExitCode::SUCCESS);

@@ -1,4 +1,4 @@
-//! `cantap list`: which boards and makers' adapters are connected, and which servers announce themselves on the network.
+//! `cantap list`: which boards, makers' adapters and CAN interfaces there are, and which servers announce themselves on the network.
 
 mod makers;
 mod network;
@@ -16,6 +16,7 @@ use crate::stderr;
 #[command(
     after_help = "Boards are found by their USB IDs. Until cantap has a product ID of its own these are pid.codes' test \
                 IDs, so another project's board may be listed too; `cantap info` tells.\n\n\
+                CAN interfaces are those of Linux, such as can0, whatever adapter is behind them.\n\n\
                 PEAK's and Kvaser's channels are those that PCAN-Basic and CANlib know, if they are installed. None is opened.\n\n\
                 Servers are found by socketcand's beacons and by DNS-SD, with which anybody on the network can announce anything: where one is and \
                 what it is called is what it says of itself.\n\n\
@@ -45,6 +46,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let boards = cantap::device::list()?;
     let makers = makers::find();
+    let interfaces = cantap_adapters::can_interfaces();
     let network = args.network.then(Network::look).transpose()?;
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -67,6 +69,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         let mut object = serde_json::json!({
             "devices": devices,
             "adapters": adapters,
+            "interfaces": interfaces,
             "without_address": makers.without_address,
             "unusable": unusable,
         });
@@ -76,12 +79,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "{object}")?;
         return Ok(ExitCode::SUCCESS);
     }
-    if boards.is_empty() && makers.channels.is_empty() {
+    if boards.is_empty() && makers.channels.is_empty() && interfaces.is_empty() {
         stderr::tell("cantap: no board is connected; plug one in, or use -d virtual, which needs none\n");
     }
     for board in boards {
         let serial = board.serial_number.as_deref().unwrap_or("-");
         writeln!(out, "{}\t{}\t{serial}", board.port, board.product.as_deref().unwrap_or("-"))?;
+    }
+    for name in &interfaces {
+        writeln!(out, "{name}\tCAN interface of this computer\t-")?;
     }
     for channel in &makers.channels {
         let in_use = if channel.in_use == Some(true) { "\tanother program has it" } else { "" };

@@ -41,6 +41,7 @@ use crate::usage_error::usage;
                 cantap monitor virtual:car\n  \
                 cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
                 cantap monitor trace.blf -b 500k --db car.dbc\n  \
+                candump can0 | cantap monitor - -b 500k\n  \
                 cantap monitor -p car.toml\n\n\
                 h shows the keys. Without a device and a file, the board that is connected is listened to. Without a \
                 bit rate, given or saved on the device, it is found by listening.")]
@@ -188,6 +189,8 @@ impl Args {
         let Some(path) = &self.file else {
             return Ok((None, self.devices.clone()));
         };
+        // Into a live view, another program writes while it is watched: `candump can0 | cantap monitor - -b 500k`.
+        let path = if path.as_os_str() == "-" && !self.once { Path::new("candump:-") } else { path };
         if Address::is_meant_by(path) {
             let address = path.to_str().unwrap_or_default().parse().map_err(address_usage)?;
             return Ok((None, vec![address]));
@@ -205,7 +208,7 @@ impl Args {
                 path.display()
             )));
         }
-        Ok((Some(path.clone()), Vec::new()))
+        Ok((Some(path.to_owned()), Vec::new()))
     }
 }
 

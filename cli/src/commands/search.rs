@@ -57,9 +57,9 @@ pub struct Args {
     /// The condition, as an option.
     #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION", add = completion::conditions())]
     condition: Option<String>,
-    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF; with a database also EngineData. If repeated, any
-    /// may match.
-    #[arg(short, long = "id", value_name = "ID", add = completion::identifiers())]
+    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF; with a database also EngineData. Of several
+    /// (123,456, or repeated) any may match.
+    #[arg(short, long = "id", value_name = "ID", value_delimiter = ',', add = completion::identifiers())]
     ids: Vec<NamedId>,
     /// These data bytes from the first on: "11 ?? 3?"; * for any number. If repeated, any may match.
     #[arg(long, value_name = "BYTES")]

@@ -40,6 +40,7 @@ mod fake_device;
 mod firmware;
 mod follow;
 mod gateway;
+mod habits;
 mod help;
 mod in_folder;
 mod json_schema;

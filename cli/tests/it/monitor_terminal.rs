@@ -29,6 +29,21 @@ fn without_a_terminal_it_says_what_to_use_instead() {
     }
 }
 
+/// `candump can0 | cantap monitor -`, as one would into other programs: keys come from the terminal, frames from candump, in either of its forms.
+#[test]
+fn what_another_program_writes_is_watched_and_the_keys_still_work() {
+    for line in ["  can0  123   [2]  11 22", "(1410714882.622188) can0 123#1122"] {
+        let program = format!("while echo '{line}'; do sleep 0.05; done");
+        let mut view = Terminal::start_behind(&program, "monitor - -b 500k", (120, 24));
+        view.wait_for("11 22");
+        view.keys("5");
+        view.wait_for("5▸");
+        view.keys("q");
+        assert_eq!(view.end(), 0);
+        view.check_given_back();
+    }
+}
+
 #[test]
 fn any_size_is_drawn_or_said_to_be_too_small_and_a_change_shows_at_once() {
     let mut view = Terminal::start(BUSY, (20, 5));

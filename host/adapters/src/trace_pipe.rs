@@ -1,4 +1,4 @@
-//! A trace that another program writes while this one reads it: `candump -L can0 | cantap capture -d candump:-`.
+//! A trace that another program writes while this one reads it: `candump -L can0 | cantap capture -d candump:-`, or what candump shows on a screen.
 //!
 //! Every format that can be read from its beginning can be read here. Its times become the device's, placed by arrivals: a trace that arrives
 //! faster than it was recorded has none to keep, and its frames are stamped on arrival. Read such a file by its name.
@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use cantap_formats::{Format, ReadOptions, open_reader};
+use cantap_formats::{Format, ReadOptions, TraceReader, open_reader};
 use cantap_trace::TraceRecord;
 use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Frame, Refusal};
@@ -51,8 +51,7 @@ impl TracePipe {
         // Opening a named pipe waits for its writer, so it happens in the thread.
         let mut source = Source::start(false, move || {
             if reader.is_none() {
-                let options = ReadOptions { format: Some(format), ..ReadOptions::default() };
-                reader = Some(open_reader(&path, &options).map_err(|error| error.to_string())?);
+                reader = Some(opened(&path, format)?);
             }
             let Some(reader) = &mut reader else { return Ok(None) };
             let mut records = Vec::new();
@@ -93,6 +92,8 @@ impl TracePipe {
             return self.oddities.count("records of a third or higher channel");
         };
         let at = match u64::try_from(record.time_ns) {
+            // What candump shows without -t has no times.
+            Ok(0) => At::arrival(arrival),
             // A trace that arrives faster than it was recorded is no fault of anybody.
             Ok(time_ns) => self.clock.place(time_ns, arrival, &mut Oddities::default()),
             Err(_) => At::arrival(arrival),
@@ -102,6 +103,18 @@ impl TracePipe {
             None => self.oddities.count("transmissions that failed elsewhere"),
         }
     }
+}
+
+/// Opens it. Of standard input the first line shows whether it is candump's log or its screen.
+fn opened(path: &str, format: Format) -> Result<TraceReader, String> {
+    let may_be_screen = path == "-" && format == Format::Candump;
+    let options = ReadOptions { format: (!may_be_screen).then_some(format), ..ReadOptions::default() };
+    let reader = open_reader(path, &options).map_err(|error| error.to_string())?;
+    let found = reader.format();
+    if found == format || may_be_screen && found == Format::CandumpScreen {
+        return Ok(reader);
+    }
+    Err(format!("it is {found} and not {format}; convert it, or read it by its name"))
 }
 
 /// What comes within [`FIRST_BYTES`]: nothing, or something of which a part is a trace. An error is the reason why it is none.

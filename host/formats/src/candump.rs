@@ -12,7 +12,7 @@ pub(crate) use encode::Encoder;
 #[cfg(test)]
 mod tests {
     use super::super::tests;
-    use crate::Format;
+    use crate::{Format, ReadOptions, TraceReader};
     use cantap_trace::testing::record_or_fd;
     use proptest::prelude::*;
 
@@ -173,6 +173,21 @@ mod tests {
         let (records, issues) = tests::read(Format::Candump, log);
         assert_eq!(issues, Vec::<String>::new());
         assert_eq!(tests::write(Format::Candump, &records), log);
+    }
+
+    /// As CAN-MIRGU has them, and others that people made of logs to find attacks.
+    #[test]
+    fn labels_behind_frames_are_noted_once_and_no_fault() {
+        let log = "(1.0) can0 123#11 0\n(2.0) can0 00000123#22 1\n(3.0) can0 124# Attack\n(4.0) can0 125#R normal\n";
+        let source = std::io::Cursor::new(log);
+        let mut reader =
+            TraceReader::from_source("test", source, Format::Candump, &ReadOptions::default()).unwrap();
+        let records: Vec<_> = reader.by_ref().map(Result::unwrap).collect();
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(1.000000) can0 123#11\n(2.000000) can0 00000123#22\n(3.000000) can0 124#\n(4.000000) can0 125#R\n"
+        );
+        assert_eq!(reader.notes().iter().map(|(_, count)| count).collect::<Vec<_>>(), [1]);
     }
 
     #[test]

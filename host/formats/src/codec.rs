@@ -56,6 +56,9 @@ pub(crate) trait Decode: Send {
         false
     }
 
+    /// What follows is the next of several files of one recording, from its beginning: what was known of the file before is not, but channels stay.
+    fn begin_next_file(&mut self) {}
+
     /// Takes up what [`Self::save_layout`] appended for the same file, before anything is read.
     fn restore_layout(&mut self, _layout: &[u8]) {}
 

@@ -59,7 +59,10 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     let text = format!("text that begins with '{shown}{more}'");
     // Read as a table in certain columns, it may be one in others.
     let is_table = matches!(read_as, Format::Csv(_) | Format::Table);
-    match table::proposal(head).filter(|_| is_table) {
+    let of_names = table::proposal(head).filter(|_| is_table);
+    // Names that say nothing may be those of a row.
+    let said = of_names.clone().filter(|columns| columns != "time=?,id=?,data=?");
+    match said.or_else(|| table::proposal_of_rows(head)).or(of_names) {
         Some(mut columns) => {
             columns.retain(|character| !cantap_trace::clean::is_harmful(character));
             format!("{text}; if it is a table of frames, say what its columns are: --columns '{columns}'")

@@ -1,10 +1,12 @@
 //! Reading a trace of any format as a stream.
 
+mod files;
 mod indexed;
 
 use std::borrow::Cow;
+use std::collections::VecDeque;
 use std::io::{self, Read};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::Format;
@@ -70,10 +72,19 @@ pub struct TraceReader {
     /// The format according to the name, if the content is in another one.
     named: Option<Format>,
     head: Vec<u8>,
+    /// The files of the recording that follow this one.
+    others: VecDeque<PathBuf>,
+    /// Whether the end that was reached is one of a file with others behind it.
+    between_files: bool,
     /// The index that is made or used, if there is one.
     indexing: Option<Box<Indexing>>,
     /// Records that were passed over.
     passed: Passed,
+}
+
+/// The beginning of a file, to say what it looks like.
+fn head_of(input: &Input) -> Vec<u8> {
+    input.buffered().iter().take(content::HEAD_BYTES).copied().collect()
 }
 
 /// What is wrong with a line of text that has NUL bytes, such as after a crash.
@@ -90,9 +101,17 @@ enum Beyond {
 
 /// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes say
 /// otherwise). Compression (gzip, zstd, xz, LZ4, bzip2) is recognised by content. Of a ZIP archive, the only file that may be a trace is read, or the
-/// one in a path such as `traces.zip/inside/a.asc`.
+/// one in a path such as `traces.zip/inside/a.asc`. A folder is one trace if it is a bag of ROS 2.
 pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let path = path.as_ref();
+    if path.is_dir() {
+        return files::open_folder(path, options);
+    }
+    open_file(path, options)
+}
+
+/// As [`open_reader`], but of no folder.
+fn open_file(path: &Path, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
     let (file, member) = archive::split(path);
     let input = Input::open(file, options.follow).map_err(|error| OpenError::Io(name.clone(), error))?;
@@ -188,7 +207,7 @@ impl TraceReader {
     fn new(name: Arc<str>, format: Format, input: Input, options: &ReadOptions) -> Self {
         let decoder = (FormatSpec::of(format).reader)(options);
         let batch = Vec::with_capacity(BATCH);
-        let head = input.buffered().iter().take(content::HEAD_BYTES).copied().collect();
+        let head = head_of(&input);
         Self {
             name,
             format,
@@ -205,6 +224,8 @@ impl TraceReader {
             records: 0,
             named: None,
             head,
+            others: VecDeque::new(),
+            between_files: false,
             indexing: None,
             passed: Passed::default(),
         }
@@ -309,13 +330,15 @@ impl TraceReader {
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));
+        self.between_files &= !self.strict;
         ReadIssue { file: self.name.clone(), place, fault }
     }
 
     /// What follows when the batch is used up. A new batch may be empty.
     fn beyond_batch(&mut self) -> Beyond {
         if self.ended {
-            return Beyond::End;
+            let next = std::mem::take(&mut self.between_files).then(|| self.others.pop_front()).flatten();
+            return next.map_or(Beyond::End, |next| self.begin_next_file(&next));
         }
         if self.after.is_none()
             && let Some(line) = self.input.nul_line()
@@ -369,7 +392,7 @@ impl TraceReader {
                     self.after = Some(Ok(Found::End));
                     return Beyond::Issue(self.issue(Place::Line(line), nul()));
                 }
-                self.ended = true;
+                (self.ended, self.between_files) = (true, !self.others.is_empty());
                 if let Err(error) = self.end_index() {
                     let place = Place::Offset(self.input.offset());
                     return Beyond::Issue(self.issue(place, Fault::Io(error)));
@@ -390,7 +413,7 @@ impl TraceReader {
                     let place = Place::Offset(self.input.offset());
                     return Beyond::Issue(self.issue(place, Fault::Truncated("the compressed data")));
                 }
-                Beyond::End
+                if self.between_files { Beyond::Batch } else { Beyond::End }
             }
             Err(error) => {
                 self.keep_index();

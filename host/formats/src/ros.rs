@@ -9,10 +9,14 @@ pub(crate) mod container;
 pub(crate) mod database;
 pub(crate) mod echo;
 mod fields;
+pub(crate) mod folder;
 pub(crate) mod mcap;
 mod nested;
 mod topics;
 
+use std::io::{Cursor, Read as _};
+
+use super::compression::Compression;
 use super::error_frames::ErrorFrames;
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::issue::Fault;
@@ -27,6 +31,9 @@ pub(crate) const OTHER_MESSAGES: &str = "messages of ROS other than CAN frames";
 /// What frames of topics such as `to_can_bus` are reported as.
 pub(crate) const SENT_TOPIC: &str =
     "frames are of a topic of requests to send (sent_messages, to_can_bus) and count as sent";
+
+/// No message with a frame is longer.
+const MAX_MESSAGE_BYTES: u64 = 4096;
 
 /// The types that are frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,6 +70,18 @@ pub(crate) fn content(
     bytes: &[u8],
     errors: &mut ErrorFrames,
 ) -> Result<Content, Fault> {
+    // With `--compression-mode message`; none of a CAN frame begins so.
+    if encoding == Encoding::Cdr && Compression::of_content(bytes) == Some(Compression::Zstd) {
+        let mut plain = Vec::new();
+        let unpacked = Compression::Zstd.unpack(Cursor::new(bytes.to_vec()));
+        let read = unpacked.and_then(|source| source.take(MAX_MESSAGE_BYTES).read_to_end(&mut plain));
+        return match read {
+            Ok(_) if Compression::of_content(&plain).is_none() => {
+                content(kind, encoding, direction, &plain, errors)
+            }
+            _ => Err(Fault::malformed("a message with a CAN frame", b"damaged compressed data")),
+        };
+    }
     let short = || Fault::malformed("a message with a CAN frame", counted(bytes.len(), "byte").as_bytes());
     let mut fields = Fields::new(encoding, bytes).ok_or_else(short)?;
     let read = match kind {

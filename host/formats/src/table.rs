@@ -81,15 +81,27 @@ pub(crate) fn split_cells(separator: u8, line: &[u8]) -> Vec<&[u8]> {
 /// How many lines may stand above the names in a table that is not known otherwise.
 const LINES: usize = 40;
 
+/// Of a line, what may be cells: a tab at its beginning is behind a cell with nothing in it, such as the name above pandas' numbers of rows.
+fn without_space(line: &[u8]) -> &[u8] {
+    let line = line.trim_ascii_end();
+    let blanks = line.iter().take_while(|byte| **byte == b' ').count();
+    &line[blanks..]
+}
+
 /// The lines that are no comments, among which the names above the columns are looked for.
 fn first_lines(head: &[u8]) -> impl Iterator<Item = &[u8]> {
-    let lines = head.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
+    let lines = head.split(|byte| *byte == b'\n').map(without_space);
     lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
 /// Columns as a user may give them for a table that is not known by itself.
 pub(crate) fn proposal(head: &[u8]) -> Option<String> {
     layout::proposal(first_lines(head).next()?)
+}
+
+/// The same for one without names, if one of the first rows shows it.
+pub(crate) fn proposal_of_rows(head: &[u8]) -> Option<String> {
+    first_lines(head).take(8).find_map(layout::proposal_of_row)
 }
 
 impl Decoder {
@@ -157,15 +169,29 @@ impl Decoder {
 
     /// Looks at the first rows' cells, before [`Self::typed_row`] takes them.
     pub(crate) fn first_typed_rows<'a>(&mut self, rows: impl Iterator<Item = &'a [&'a [u8]]>) {
-        let place = self.layout.as_ref().and_then(|layout| layout.place(Role::Id));
-        let ids: Vec<_> =
-            rows.filter_map(|cells| place.and_then(|place| cells.get(place.at).copied())).collect();
+        let Some(layout) = &self.layout else { return };
+        let place = layout.place(Role::Id);
+        let rows: Vec<_> = rows.collect();
+        let at = |cells: &&'a [&'a [u8]], role| cells.get(layout.place(role)?.at).copied();
+        let ids: Vec<_> = rows.iter().filter_map(|cells| at(cells, Role::Id)).collect();
+        let times: Vec<_> =
+            rows.iter().filter_map(|cells| at(cells, Role::Time).zip(at(cells, Role::Id))).collect();
+        let unit = unit_of(layout, &times);
         let form = place.and_then(|place| place.form);
         let (is_decimal, is_sure) =
             form.map_or_else(|| ids_are_decimal(&ids), |form| (form == Form::Decimal, true));
         self.radix.id = is_decimal;
         if !is_sure {
             self.notes.push(MAY_BE_DECIMAL);
+        }
+        self.take_unit(unit);
+    }
+
+    /// Reads times without a unit in this one, if the rows show one and none was found before.
+    fn take_unit(&mut self, unit: Option<(i64, &'static str)>) {
+        if let (Some((unit_ns, what)), None) = (unit, self.unit_ns) {
+            self.unit_ns = Some(unit_ns);
+            self.notes.push(what);
         }
     }
 
@@ -189,14 +215,14 @@ impl Decoder {
 
     /// How identifiers and bytes are written, by what is said, and otherwise by what the first rows have.
     fn radix_of(&mut self, layout: &Layout, is_row: bool) -> Result<Radix, Fault> {
-        let lines = self.sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii);
-        let rows = lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"));
-        let (mut ids, mut bytes) = (Vec::new(), Vec::new());
+        let rows = first_lines(&self.sample);
+        let (mut ids, mut bytes, mut times) = (Vec::new(), Vec::new(), Vec::new());
         let data = layout.place(Role::Data).or(layout.place(Role::Bytes));
         for row in rows.skip(if is_row { 0 } else { self.lines_above_names() + 1 }) {
             let cells = layout.separator.cells(row);
             let at = |role| layout.place(role).and_then(|place| cells.get(place.at)).copied();
             ids.extend(at(Role::Id));
+            times.extend(at(Role::Time).zip(at(Role::Id)));
             if let Some(first) = layout.place(Role::Bytes) {
                 bytes.extend(cells.iter().skip(first.at).take(layout.byte_columns.min(8)).copied());
             }
@@ -205,6 +231,7 @@ impl Decoder {
             let expected = "identifiers in a column that counts the rows: --columns id=NAME,data=NAME says which has them";
             return Err(Fault::malformed(expected, ids[0]));
         }
+        let unit = unit_of(layout, &times);
         let form = layout.place(Role::Id).and_then(|place| place.form);
         let (id, is_sure) = form.map_or_else(|| ids_are_decimal(&ids), |form| (form == Form::Decimal, true));
         if !is_sure {
@@ -213,8 +240,12 @@ impl Decoder {
         let data = match data.and_then(|place| place.form) {
             Some(form) => form == Form::Decimal,
             // Hexadecimal bytes have two digits at most.
-            None => bytes.iter().any(|byte| byte.len() == 3 && text::decimal(byte).is_some()),
+            None => bytes.iter().any(|byte| {
+                let number = cells::whole(byte);
+                text::decimal(number).is_some() && (number.len() == 3 || number.len() < byte.len())
+            }),
         };
+        self.take_unit(unit);
         Ok(Radix { id, data })
     }
 
@@ -389,6 +420,14 @@ impl Decoder {
     }
 }
 
+/// The unit of the times in these rows, each with its identifier, and what to say of it, where nothing else shows it.
+fn unit_of(layout: &Layout, rows: &[(&[u8], &[u8])]) -> Option<(i64, &'static str)> {
+    let has_unit = layout.place(Role::Time)?.form.is_some();
+    // A date of our days shows its unit.
+    let is_date = rows.iter().any(|(time, _)| time::unit_of(time) != text::NS_PER_S);
+    (!has_unit && !is_date).then(|| time::unit_of_rows(rows))?
+}
+
 /// Whether a row is of a frame that was never on the bus.
 fn is_rejected(layout: &Layout, line: &[u8]) -> bool {
     let Some(place) = layout.place(Role::Channel).filter(|_| layout.is_cabana) else { return false };
@@ -435,7 +474,12 @@ impl RowFormat for Decoder {
         self.above = self.lines_above_names();
     }
 
+    fn trims(&self) -> bool {
+        false
+    }
+
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
+        let line = without_space(line);
         if line.is_empty() || line.starts_with(b"#") {
             self.day = self.day.or_else(|| FileDate::of_comment(line));
             return Ok(Line::Nothing);

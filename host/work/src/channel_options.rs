@@ -8,7 +8,7 @@ use cantap::autobaud::{Limits, Outcome};
 use cantap::device::channel_number;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
-use cantap::wire::message::{ChannelConfig, Defaults, Mode};
+use cantap::wire::message::{ChannelConfig, Defaults, Mode, capability};
 use cantap_address::OpenDevice;
 use cantap_trace::filter::Filter;
 
@@ -285,6 +285,10 @@ impl ChannelOptions {
             None => match (device.defaults(channel)?, device.bitrate_of_bus(channel)) {
                 (Some(saved), _) => (saved.config, Some(saved)),
                 (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
+                (None, None) if device.hello().capabilities & capability::NO_BIT_RATE != 0 => bail!(
+                    "the bit rate of channel {} is set elsewhere, and this device does not say it: give it with -b RATE, such as -b 500k",
+                    self.number(channel)
+                ),
                 (None, None) => bail!(
                     "no bit rate for channel {}: give one with -b RATE, have it found with -b auto, or save one \
                      with `cantap defaults save`",

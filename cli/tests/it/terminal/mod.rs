@@ -38,9 +38,24 @@ impl Terminal {
         columns_rows: (u16, u16),
         environment: &[(&str, Option<&str>)],
     ) -> Self {
-        let pair = native_pty_system().openpty(size(columns_rows)).unwrap();
         let mut command = CommandBuilder::new(env!("CARGO_BIN_EXE_cantap"));
         command.args(arguments.split_whitespace());
+        Self::of(command, columns_rows, environment)
+    }
+
+    /// With what a line for the shell writes as its standard input.
+    pub fn start_behind(line: &str, arguments: &str, columns_rows: (u16, u16)) -> Self {
+        let mut command = CommandBuilder::new("sh");
+        command.args(["-c", &format!("{{ {line}; }} | {} {arguments}", env!("CARGO_BIN_EXE_cantap"))]);
+        Self::of(command, columns_rows, &[])
+    }
+
+    fn of(
+        mut command: CommandBuilder,
+        columns_rows: (u16, u16),
+        environment: &[(&str, Option<&str>)],
+    ) -> Self {
+        let pair = native_pty_system().openpty(size(columns_rows)).unwrap();
         command.cwd(Path::new(env!("CARGO_MANIFEST_DIR")));
         command.env("TERM", "xterm-256color");
         command.env("LC_ALL", "C.UTF-8");

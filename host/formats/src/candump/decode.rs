@@ -19,6 +19,7 @@ use cantap_trace::socketcan::ERROR_FLAG;
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 const NO_TIMES: &str = "frames have no time: they are a list for cansend";
+const LABELS: &str = "labels behind the frames, such as marks of attacks, have no place in a trace";
 /// The flag of 29 bits in SocketCAN's number of an identifier.
 const EXTENDED_FLAG: u32 = 0x8000_0000;
 const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEEF'";
@@ -33,6 +34,7 @@ pub(crate) struct Decoder {
     untimed: Option<bool>,
     /// To be reported once.
     note: Option<&'static str>,
+    has_labels: bool,
     /// The last line looked whole and had no line end.
     end_missing: bool,
     /// The digits and time of the last second: most lines are in the same second as the one before.
@@ -203,6 +205,12 @@ impl Decoder {
         let direction = match rest.trim_ascii() {
             b"" | b"R" | b"r" => Direction::Rx,
             b"T" | b"t" => Direction::Tx,
+            label if is_label(label) => {
+                if !std::mem::replace(&mut self.has_labels, true) {
+                    self.note = Some(LABELS);
+                }
+                Direction::Rx
+            }
             other => return Err(Fault::malformed("'R', 'T' or nothing after the frame", other)),
         };
         let (event, second) = self.event(frame).ok_or_else(malformed)??;
@@ -270,6 +278,12 @@ fn untimed_parts(line: &[u8]) -> Option<(&[u8], &[u8])> {
         (interface, Some(frame), None) => Some((interface, frame)),
         _ => None,
     }
+}
+
+/// Whether a word behind a frame says if it belongs to an attack, as in CAN-MIRGU and other sets of data.
+fn is_label(word: &[u8]) -> bool {
+    let labels = ["0", "1", "normal", "benign", "attack", "malicious", "anomaly", "injected"];
+    labels.iter().any(|label| word.eq_ignore_ascii_case(label.as_bytes()))
 }
 
 /// Whether a line is one of a list of frames without times.

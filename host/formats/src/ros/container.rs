@@ -125,6 +125,10 @@ impl<C: Container> Decode for Decoder<C> {
         false
     }
 
+    fn begin_next_file(&mut self) {
+        (self.state, self.chunk, self.container) = (State::Begin, None, C::default());
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         loop {
             if let Some(found) = self.known.errors.next() {

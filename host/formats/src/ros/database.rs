@@ -13,9 +13,6 @@ use super::super::issue::Fault;
 use super::{Encoding, Kind, OTHER_MESSAGES, SENT_TOPIC, Topic, Topics, content};
 use cantap_trace::{Direction, TraceRecord};
 
-/// A bag's messages in their order, from the one with the next number.
-pub(crate) const COLUMNS: &str = "rowid, topic_id, timestamp, data FROM messages";
-
 /// What is known of a bag's topics.
 pub(crate) struct Bag {
     topics: HashMap<i64, Option<(Kind, Topic)>>,
@@ -23,7 +20,7 @@ pub(crate) struct Bag {
 
 impl Bag {
     /// Reads the topics; `None` if the database is no bag.
-    pub(crate) fn open(database: &Connection) -> rusqlite::Result<Option<Self>> {
+    pub(crate) fn open(database: &Connection, known: &mut Topics) -> rusqlite::Result<Option<Self>> {
         let tables =
             "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages')";
         if database.query_row(tables, [], |row| row.get::<_, i64>(0))? < 2 {
@@ -31,7 +28,6 @@ impl Bag {
         }
         let mut statement = database.prepare("SELECT id, name, type, serialization_format FROM topics")?;
         let mut rows = statement.query([])?;
-        let mut known = Topics::default();
         let mut topics = HashMap::new();
         while let Some(row) = rows.next()? {
             let text =
@@ -41,6 +37,15 @@ impl Bag {
             topics.insert(row.get(0)?, kind.map(|kind| (kind, known.topic(name))));
         }
         Ok(Some(Self { topics }))
+    }
+
+    /// What is asked for of a bag's messages in their order. What is no frame, such as a picture, is not read from the disk.
+    pub(crate) fn columns(&self) -> String {
+        let frames = self.topics.iter().filter(|(_, topic)| topic.is_some()).map(|(id, _)| id.to_string());
+        let frames = frames.collect::<Vec<_>>().join(", ");
+        format!(
+            "rowid, topic_id, timestamp, CASE WHEN topic_id IN ({frames}) THEN data ELSE x'' END FROM messages"
+        )
     }
 
     /// Adds what a message contains.

@@ -7,17 +7,23 @@ use cantap_trace::fd::FD_MAX_BYTES;
 
 pub(super) fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
     let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
+    let digits = if decimal { whole(digits) } else { digits };
     let number = text::number(digits, decimal);
     let expected =
         if decimal { "an identifier in decimal digits" } else { "an identifier in hexadecimal digits" };
     number.ok_or_else(|| Fault::malformed(expected, shown))
 }
 
-/// A length; programs that know no whole numbers write it with a fraction.
+/// A whole number without the fraction that programs put behind it which know no whole numbers, such as pandas where a row has nothing in its column.
+pub(super) fn whole(cell: &[u8]) -> &[u8] {
+    cell.strip_suffix(b".0").unwrap_or(cell)
+}
+
+/// A length.
 pub(super) fn length(cell: &[u8]) -> Result<usize, Fault> {
     let number = match text::after_0x(cell) {
         Some(digits) => text::hex(digits).map(u64::from),
-        None => text::decimal(cell.strip_suffix(b".0").unwrap_or(cell)),
+        None => text::decimal(whole(cell)),
     };
     let len = number.filter(|len| *len <= FD_MAX_BYTES as u64);
     len.map(|len| len as usize).ok_or_else(|| Fault::malformed("a length of 0 to 64", cell))
@@ -56,12 +62,14 @@ pub(super) fn is_empty(cell: &[u8]) -> bool {
 
 /// One byte.
 pub(super) fn byte(cell: &[u8], decimal: bool) -> Option<u8> {
+    let cell = if decimal { whole(cell) } else { cell };
     text::number(cell, decimal).and_then(|byte| u8::try_from(byte).ok())
 }
 
-/// Whether a cell is a list as Python prints one, `[78, 32, 137]`: its numbers are decimal.
+/// Whether a cell is a list or a tuple as Python prints one, `[78, 32, 137]`: its numbers are decimal.
 pub(super) fn is_list(cell: &[u8]) -> bool {
-    let inner = cell.strip_prefix(b"[").and_then(|cell| cell.strip_suffix(b"]"));
+    let between = |first: &[u8], last: &[u8]| cell.strip_prefix(first)?.strip_suffix(last);
+    let inner = between(b"[", b"]").or_else(|| between(b"(", b")"));
     let is_number =
         |word: &[u8]| text::decimal(word).is_some() && (word.len() == 1 || !word.starts_with(b"0"));
     inner.is_some_and(|inner| {
@@ -69,10 +77,51 @@ pub(super) fn is_list(cell: &[u8]) -> bool {
     })
 }
 
-/// The bytes of a cell: digits without gaps, or bytes with something between them.
+/// What Python prints of bytes, between its quotation marks: of `b'\xca\x18%'` or `bytearray(b'\xca\x18%')`, what an `str` of a message's data is.
+fn python_bytes(cell: &[u8]) -> Option<&[u8]> {
+    let inner = cell.strip_prefix(b"bytearray(").and_then(|cell| cell.strip_suffix(b")")).unwrap_or(cell);
+    let quoted = inner.strip_prefix(b"b")?;
+    // A cell with a quotation mark in it has each one twice.
+    [&b"'"[..], b"\"\"", b"\""].iter().find_map(|mark| quoted.strip_prefix(*mark)?.strip_suffix(*mark))
+}
+
+/// The bytes that Python printed: those of letters as letters, the others escaped.
+fn push_python_bytes(shown: &[u8], bytes: &mut Vec<u8>) -> Option<()> {
+    let mut rest = shown;
+    while let Some((first, after)) = rest.split_first() {
+        let (byte, after) = match (first, after) {
+            (b'\\', [b'x', high, low, after @ ..]) => (text::hex_pair(*high, *low)?, after),
+            (b'\\', [escaped, after @ ..]) => {
+                let byte = match escaped {
+                    b'n' => b'\n',
+                    b'r' => b'\r',
+                    b't' => b'\t',
+                    b'\\' | b'\'' | b'"' => *escaped,
+                    _ => return None,
+                };
+                (byte, after)
+            }
+            (b'\\', []) => return None,
+            (b'"', [b'"', after @ ..]) => (b'"', after),
+            _ => (*first, after),
+        };
+        bytes.push(byte);
+        rest = after;
+    }
+    Some(())
+}
+
+/// The bytes of a cell: digits without gaps, bytes with something between them, or what Python prints.
 pub(super) fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fault> {
-    let is_between =
-        |byte: &u8| matches!(byte, b' ' | b'-' | b':' | b',' | b';' | b'_' | b'.' | b'|' | b'[' | b']');
+    if let Some(shown) = python_bytes(cell) {
+        return push_python_bytes(shown, bytes).ok_or_else(|| Fault::malformed("data bytes", cell));
+    }
+    let is_between = |byte: &u8| {
+        matches!(
+            byte,
+            b' ' | b'-' | b':' | b',' | b';' | b'_' | b'.' | b'|' | b'[' | b']' | b'\'' | b'(' | b')'
+        )
+    };
     for word in cell.split(is_between).filter(|word| !word.is_empty()) {
         let fault = || Fault::malformed("data bytes", cell);
         // No bytes at all, as Cabana writes them.

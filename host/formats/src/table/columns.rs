@@ -190,6 +190,19 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         let (role, form) = role_of(field)?;
         return Some((role, role.takes(Form::Decimal).then_some(Form::Decimal).or(form)));
     }
+    // As `tshark -T fields` and `-T json` name them, whose identifiers are decimal.
+    match name {
+        b"frame.time_epoch" | b"frame.time_relative" => {
+            return Some((Role::Time, Some(Form::Unit(1_000_000_000))));
+        }
+        b"can.id" => return Some((Role::Id, Some(Form::Decimal))),
+        b"can.len" => return Some((Role::Dlc, None)),
+        b"data.data" => return Some((Role::Data, Some(Form::Hex))),
+        b"can.flags.xtd" => return Some((Role::Extended, None)),
+        b"can.flags.rtr" => return Some((Role::Remote, None)),
+        b"can.flags.err" => return Some((Role::Error, None)),
+        _ => {}
+    }
     let stem = plain.trim_end_matches(|last: char| last.is_ascii_digit());
     if stem.len() < plain.len() && matches!(stem, "d" | "b" | "data" | "byte" | "databyte" | "db") {
         return Some((Role::Bytes, None));
@@ -218,6 +231,13 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
             return Some((Role::Time, form));
         }
     }
+    // As sketches call what their boards count.
+    match plain {
+        "t" => return Some((Role::Time, None)),
+        "millis" => return Some((Role::Time, Some(Form::Unit(1_000_000)))),
+        "micros" => return Some((Role::Time, Some(Form::Unit(1_000)))),
+        _ => {}
+    }
     let (bare, radix) = match (plain.strip_suffix("hex"), plain.strip_suffix("dec")) {
         (Some(bare), _) => (bare, Some(Form::Hex)),
         (_, Some(bare)) => (bare, Some(Form::Decimal)),
@@ -226,7 +246,8 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     let role = match bare {
         "id" | "canid" | "arbitrationid" | "arbid" | "identifier" | "canidentifier" | "addr" | "address"
         | "messageid" | "msgid" | "frameid" | "idh" => Role::Id,
-        "dlc" | "dl" | "len" | "length" | "datalength" | "datalen" | "candlc" | "control" => Role::Dlc,
+        "dlc" | "dl" | "len" | "length" | "datalength" | "datalen" | "candlc" | "control"
+        | "messagelength" => Role::Dlc,
         "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" => Role::Data,
         "bus" | "busid" | "busnumber" => return Some((Role::Channel, Some(Form::FromZero))),
         "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" => Role::Channel,
@@ -293,10 +314,14 @@ mod tests {
             ("Byte 3", Role::Bytes),
             ("DLC", Role::Dlc),
             ("Bus", Role::Channel),
+            ("t", Role::Time),
+            ("MessageLength", Role::Dlc),
         ] {
             assert_eq!(role_of(name.as_bytes()).map(|(role, _)| role), Some(role), "{name}");
         }
-        assert_eq!(role_of(b"Time [ms]"), Some((Role::Time, Some(Form::Unit(1_000_000)))));
+        for (name, unit_ns) in [("Time [ms]", 1_000_000), ("millis", 1_000_000), ("micros", 1_000)] {
+            assert_eq!(role_of(name.as_bytes()), Some((Role::Time, Some(Form::Unit(unit_ns)))), "{name}");
+        }
         for none in ["", "Time (rel)", "Label", "Signal1_of_ID", "Class", "D", "timer"] {
             assert_eq!(role_of(none.as_bytes()), None, "{none}");
         }

@@ -72,7 +72,8 @@ impl Layout {
     pub(super) fn least_cells(&self) -> usize {
         let may_be_missing = |role: Role| match role {
             Role::Bytes => true,
-            Role::Data => self.separator == Separator::Blanks,
+            // Of a row that ends with nothing behind a tab, that tab is space at the end of a line.
+            Role::Data => matches!(self.separator, Separator::Blanks | Separator::Byte(b'\t')),
             _ => false,
         };
         let needed = ROLES.iter().filter(|(_, role)| !may_be_missing(*role));
@@ -119,6 +120,14 @@ impl Layout {
                     None => layout.has_others = true,
                 },
             }
+        }
+        // As the panda's own logger and libpanda call the bytes; elsewhere it is the name of a message.
+        let at_name = |wanted: &[u8]| names.iter().position(|name| name.eq_ignore_ascii_case(wanted));
+        if let (None, None, Some(_), Some(at)) =
+            (layout.place(Role::Data), layout.place(Role::Bytes), at_name(b"MessageID"), at_name(b"Message"))
+        {
+            layout.places[Role::Data as usize] = Some(Place { at, form: Some(Form::Hex) });
+            layout.has_others = names.len() > layout.places.iter().flatten().count() + layout.kinds.len();
         }
         layout.is_cabana = names == [&b"time"[..], b"addr", b"bus", b"data"];
         let has = |role| layout.place(role).is_some();
@@ -224,15 +233,19 @@ impl Layout {
 
     /// A time, an identifier, a length and as many bytes, in one cell or one each. What follows, such as a mark of an attack, has no place in
     /// a trace, nor has the `000` between identifier and length of data sets of HCRL and CrySyS. A channel may stand before an identifier that has `0x`
-    /// before it.
+    /// before it, and a direction before any.
     fn with_length(separator: Separator, cells: &[&[u8]]) -> Option<Self> {
         let is_channel = |cell: &[u8]| cell.len() <= 2 && text::decimal(cell).is_some();
+        let is_direction = |cell: &[u8]| cell.eq_ignore_ascii_case(b"rx") || cell.eq_ignore_ascii_case(b"tx");
         let (cells, before, between) = match cells {
-            [time, id, b"000", rest @ ..] => (&[&[*time, *id], rest].concat()[..], 0, 1),
+            [time, id, b"000", rest @ ..] => (&[&[*time, *id], rest].concat()[..], None, 1),
             [time, channel, id, rest @ ..] if is_channel(channel) && text::after_0x(id).is_some() => {
-                (&[&[*time, *id], rest].concat()[..], 1, 0)
+                (&[&[*time, *id], rest].concat()[..], Some(Role::Channel), 0)
             }
-            _ => (cells, 0, 0),
+            [time, direction, rest @ ..] if is_direction(direction) => {
+                (&[&[*time], rest].concat()[..], Some(Role::Direction), 0)
+            }
+            _ => (cells, None, 0),
         };
         let [time, id, len, data @ ..] = cells else { return None };
         let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
@@ -250,9 +263,14 @@ impl Layout {
         let mut places = [None; ROLES.len()];
         let hex = Some(Form::Hex);
         places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
-        places[Role::Id as usize] = Some(Place { at: 1 + before, form: hex });
+        if let Some(role) = before {
+            places[role as usize] = Some(Place { at: 1, form: None });
+        }
+        let before = usize::from(before.is_some());
+        // Without `0x` the rows show whether they are decimal, as those of `tshark -T fields` are.
+        let form = text::after_0x(id).and(hex);
+        places[Role::Id as usize] = Some(Place { at: 1 + before, form });
         places[Role::Dlc as usize] = Some(Place { at: 2 + before + between, form: None });
-        places[Role::Channel as usize] = (before > 0).then_some(Place { at: 1, form: None });
         let role = if one_each { Role::Bytes } else { Role::Data };
         places[role as usize] = Some(Place { at: 3 + before + between, form: hex });
         let has_others = data.len() > if one_each { len } else { 1 };
@@ -328,4 +346,21 @@ pub(super) fn proposal(line: &[u8]) -> Option<String> {
     };
     let [time, id] = [Role::Time, Role::Id].map(|role| named(role).unwrap_or_else(unknown));
     Some(format!("time={time},id={id},{data}"))
+}
+
+/// The same for rows without names, such as `7E8 03 41 0C 1A`: columns by their numbers. The bytes are what stands last.
+pub(super) fn proposal_of_row(line: &[u8]) -> Option<String> {
+    let cells = Separator::of(line).cells(line);
+    let bare = |cell: &'_ [u8]| text::after_0x(cell).unwrap_or(cell).to_vec();
+    let is_byte = |cell: &&&[u8]| bare(cell).len() == 2 && text::hex(&bare(cell)).is_some();
+    let bytes = cells.iter().rev().take_while(is_byte).count();
+    let before = &cells[..cells.len() - bytes];
+    let is_id = |cell: &&[u8]| matches!(bare(cell).len(), 3 | 4 | 8) && text::hex(&bare(cell)).is_some();
+    let id = before.iter().rposition(is_id).filter(|_| bytes > 0)?;
+    let is_time = |cell: &&[u8]| cell.contains(&b'.') && text::time(cell, NS_PER_S, b'.').is_some();
+    let time = before[..id].iter().position(is_time).map_or(String::new(), |at| format!("time={},", at + 1));
+    let is_len =
+        before.len() > id + 1 && before.last().is_some_and(|len| text::decimal(len) == Some(bytes as u64));
+    let len = if is_len { format!("dlc={},", before.len()) } else { String::new() };
+    Some(format!("{time}id={}:hex,{len}bytes={}:hex", id + 1, before.len() + 1))
 }

@@ -301,3 +301,130 @@ proptest! {
         prop_assert_eq!(records.len() + issues.len(), lines + first);
     }
 }
+
+/// As sketches write them with `millis()` or `micros()`: taken for seconds, a trace of a minute would last for hours or weeks.
+#[test]
+fn whole_numbers_of_no_unit_are_in_the_one_that_fits_how_often_identifiers_come() {
+    for (head, per_ms) in [("time,id,dlc,data", 1), ("Time,ID,DLC,Data", 1000), ("t,id,dlc,data", 1000)] {
+        let rows = (0..40).map(|n| {
+            format!("{},{},1,{:02X}\n", per_ms * 10 * (n + 1), if n % 10 == 9 { "1A0" } else { "0C0" }, n)
+        });
+        let file = format!("{head}\n{}", rows.collect::<String>());
+        let (log, issues) = as_log(&file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert!(log.starts_with("(0.010000) can0 0C0#00\n(0.020000) can0 0C0#01\n"), "{log}");
+        let source = std::io::Cursor::new(file.into_bytes());
+        let mut reader =
+            TraceReader::from_source("test", source, Format::Table, &ReadOptions::default()).unwrap();
+        assert_eq!(reader.by_ref().count(), 40);
+        let notes: Vec<_> = reader.notes().iter().map(|(what, _)| what).collect();
+        assert!(
+            notes.iter().any(|what| what.starts_with("times without a unit were read as m")),
+            "{notes:?}"
+        );
+    }
+    // Seconds since 1970 in whole numbers, of which many frames have the same.
+    let rows = (0..60).map(|n| format!("{},0C0,1,{n:02X}\n", 1_478_198_376 + n / 20));
+    let (log, issues) = as_log(&format!("timestamp,id,dlc,data\n{}", rows.collect::<String>()));
+    assert_eq!(issues, Vec::<String>::new());
+    assert!(log.starts_with("(1478198376.000000) can0 0C0#00\n"), "{log}");
+}
+
+/// As scripts around python-can write a message's `data`, and pandas what it read with gaps.
+#[test]
+fn bytes_are_read_as_python_and_pandas_print_them() {
+    for cell in [
+        r#"b'\x01 ,\\'"#,
+        r#""b'\x01 ,\\'""#,
+        r#""bytearray(b'\x01 ,\\')""#,
+        r#""['0x1', '0x20', '0x2c', '0x5c']""#,
+        r#""['01', '20', '2c', '5c']""#,
+        r#""[1, 32, 44, 92]""#,
+        r#""(1, 32, 44, 92)""#,
+    ] {
+        let cell = if cell.starts_with('b') { cell.replace(',', r"\x2c") } else { cell.to_owned() };
+        let (log, issues) = as_log(&format!("timestamp,arbitration_id,dlc,data\n1.5,0x123,4,{cell}\n"));
+        assert_eq!((log.as_str(), issues), ("(1.500000) can0 123#01202C5C\n", vec![]), "{cell}");
+    }
+    let quoted = r#""bytearray(b'a""\'\n\r\t')""#;
+    let (log, issues) = as_log(&format!("timestamp,arbitration_id,dlc,data\n1.5,0x123,6,{quoted}\n"));
+    assert_eq!((log.as_str(), issues), ("(1.500000) can0 123#6122270A0D09\n", vec![]));
+    for bad in [r"b'\x1'", r"b'\q'", r"b'\'", "b'1", "bytearray(1)", r"b'\xzz'"] {
+        let (log, issues) = as_log(&format!("timestamp,arbitration_id,data\n1.5,0x123,{bad}\n"));
+        assert_eq!((log.as_str(), issues.len()), ("", 1), "{bad}");
+    }
+    let (log, issues) = as_log(
+        "Timestamp,CAN_ID,DLC,DATA0,DATA1,DATA2,Label\n0.1,291,3.0,1.0,32.0,44.0,0\n0.2,292.0,1.0,9.0,,,0\n0.3,1300,0.0,,,,1\n",
+    );
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(0.100000) can0 123#01202C\n(0.200000) can0 124#09\n(0.300000) can0 514#\n");
+}
+
+/// As the panda's own logger, libpanda and strym write them.
+#[test]
+fn the_pandas_columns_are_known() {
+    let frame = "(1.500000) can0 123#0011\n";
+    for file in [
+        "Bus,MessageID,Message,MessageLength,Time\n0,0x123,0x0011,2,1.5\n",
+        "Time,Bus,MessageID,Message,MessageLength\n1.5,0,0x123,0011,2\n",
+    ] {
+        assert_eq!(as_log(file), (frame.to_owned(), vec![]), "{file}");
+    }
+    let (log, issues) = as_log("Bus,MessageID,Message\n1,0x123,c000c00000000000\n");
+    assert_eq!((log.as_str(), issues), ("(0.000000) can1 123#C000C00000000000\n", vec![]));
+    // Where there are bytes elsewhere, it is a name.
+    let (log, issues) = as_log("Time,MessageID,Message,Data\n1.5,0x123,Engine,0011\n");
+    assert_eq!((log.as_str(), issues), (frame, vec![]));
+}
+
+/// Space at the ends of a line with tabs is cells with nothing in them.
+#[test]
+fn a_row_with_tabs_may_begin_or_end_with_an_empty_cell() {
+    let (log, issues) = as_log("time\tid\tdlc\tdata\n1.5\t123\t0\t\n1.6\t124\t1\t11\n");
+    assert_eq!((log.as_str(), issues), ("(1.500000) can0 123#\n(1.600000) can0 124#11\n", vec![]));
+    let (log, issues) = as_log("\ttime\tid\tdata\n0\t1.5\t123\t11\n1\t1.6\t124\t12\n");
+    assert_eq!((log.as_str(), issues), ("(1.500000) can0 123#11\n(1.600000) can0 124#12\n", vec![]));
+}
+
+/// As students write what a bus says to a tester and back.
+#[test]
+fn a_direction_may_stand_before_the_identifier() {
+    let (log, issues) =
+        as_log("0.000000  Tx  0x7DF   2  02 10\n0.002000  Rx  0x7E8   3  02 50 01\n0.003 Rx 123 0\n");
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(0.000000) can0 7DF#0210 T\n(0.002000) can0 7E8#025001\n(0.003000) can0 123#\n");
+}
+
+/// As an ELM327 prints frames, and others who leave out what everybody knows.
+#[test]
+fn rows_without_names_get_columns_by_their_numbers_to_try() {
+    for (row, columns) in [
+        ("7E8 03 41 0C 1A", Some("id=1:hex,bytes=2:hex")),
+        ("ATMA\r\n18DAF110 8 03 41 0C 1A 00 00 00 00", Some("id=1:hex,dlc=2,bytes=3:hex")),
+        ("1.5 can0 Rx 123 AA", Some("time=1,id=4:hex,bytes=5:hex")),
+        ("415,FE,15", Some("id=1:hex,bytes=2:hex")),
+        ("a text of words", None),
+        ("2024-01-01 12:00:00 started", None),
+    ] {
+        assert_eq!(super::proposal_of_rows(row.as_bytes()).as_deref(), columns, "{row}");
+    }
+    let (log, issues) = with_columns("id=1:hex,bytes=2:hex", "7E8 03 41 0C 1A\n7E9 01\n");
+    assert_eq!((log.as_str(), issues), ("(0.000000) can0 7E8#03410C1A\n(0.000000) can0 7E9#01\n", vec![]));
+}
+
+/// As `tshark -T fields` prints them, with names and without.
+#[test]
+fn what_tshark_prints_is_read_with_decimal_identifiers() {
+    let log = "(1478198376.389927) can0 080#CA18\n(1478198376.390151) can0 00000260#\n(1478198376.390152) can0 123#R2\n";
+    for separator in ["\t", ","] {
+        let file = "frame.time_epoch,can.id,can.flags.xtd,can.flags.rtr,can.flags.err,can.len,data.data\n\
+                    1478198376.389927000,128,0,False,0,2,ca18\n1478198376.390151000,608,1,False,0,0,\n\
+                    1478198376.390152000,291,0,True,0,2,\n1478198376.390153000,8,0,False,1,2,ca:18\n";
+        assert_eq!(as_log(&file.replace(',', separator)), (log.to_owned(), vec![]));
+    }
+    // Without names, identifiers of the same number of digits without a letter are decimal if there are many.
+    let row = |n: u32| format!("1478198376.{:06}000\t{}\t1\t{n:02x}\n", n, 100 + 13 * n);
+    let (log, issues) = as_log(&(0..20).map(row).collect::<String>());
+    assert_eq!(issues, Vec::<String>::new());
+    assert!(log.starts_with("(1478198376.000000) can0 064#00\n(1478198376.000001) can0 071#01\n"), "{log}");
+}

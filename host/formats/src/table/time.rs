@@ -1,5 +1,7 @@
 //! The times in tables: numbers, dates, and the stamps of CSS Electronics' older loggers.
 
+use std::collections::HashMap;
+
 use jiff::Timestamp;
 use jiff::civil::DateTime;
 use jiff::tz::Offset;
@@ -16,6 +18,39 @@ pub(super) fn unit_of(cell: &[u8]) -> i64 {
         Some(100_000_000_000..) => 1_000_000,
         _ => NS_PER_S,
     }
+}
+
+/// What the rows say about the unit of times that have none and no fraction, if anything, by how often an identifier comes: a message's period is
+/// mostly some tens to some hundreds of milliseconds. Each row is its time and its identifier. The second value says it in words.
+pub(super) fn unit_of_rows(rows: &[(&[u8], &[u8])]) -> Option<(i64, &'static str)> {
+    /// As many times of an identifier as make a period.
+    const ENOUGH: u64 = 3;
+    // A part of one is none of a number without a fraction.
+    let whole = |cell: &[u8]| text::decimal(cell).or_else(|| text::decimal(cell.strip_suffix(b".0")?));
+    let mut of_ids: HashMap<&[u8], (u64, u64, u64)> = HashMap::new();
+    for (time, id) in rows {
+        let time = whole(time)?;
+        let (first, last, count) = of_ids.entry(id).or_insert((time, time, 0));
+        (*first, *last, *count) = ((*first).min(time), (*last).max(time), *count + 1);
+    }
+    let periods = of_ids.values().filter(|(_, _, count)| *count >= ENOUGH);
+    let mut periods: Vec<f64> =
+        periods.map(|(first, last, count)| (last - first) as f64 / (count - 1) as f64).collect();
+    periods.sort_by(f64::total_cmp);
+    // In seconds it would be some hundredths to a few, and so on in thousandths.
+    Some(match *periods.get(periods.len() / 2)? {
+        ..3.0 => {
+            (NS_PER_S, "times without a unit were read as seconds, which fits how often identifiers come")
+        }
+        3.0..3e3 => (
+            1_000_000,
+            "times without a unit were read as milliseconds, which fits how often identifiers come",
+        ),
+        3e3..3e6 => {
+            (1_000, "times without a unit were read as microseconds, which fits how often identifiers come")
+        }
+        _ => (1, "times without a unit were read as nanoseconds, which fits how often identifiers come"),
+    })
 }
 
 /// A number in this unit, also with an exponent.
@@ -159,5 +194,26 @@ mod tests {
             assert_eq!(number(bad.as_bytes(), NS_PER_S), None, "{bad}");
         }
         assert_eq!((unit_of(b"1614875400123456"), unit_of(b"12")), (1000, NS_PER_S));
+    }
+
+    /// Two messages, every 10 and every 100 ms, as loggers write them in each unit.
+    #[test]
+    fn how_often_identifiers_come_shows_a_unit() {
+        for (per_ms, unit_ns) in [(1_000_000, 1), (1_000, 1_000), (1, 1_000_000)] {
+            let times: Vec<String> = (0..60).map(|n| (10 * n * per_ms).to_string()).collect();
+            let rows = times
+                .iter()
+                .enumerate()
+                .map(|(n, time)| (time.as_bytes(), if n % 10 == 9 { &b"456"[..] } else { b"123" }));
+            let rows: Vec<_> = rows.collect();
+            assert_eq!(unit_of_rows(&rows).map(|(unit_ns, _)| unit_ns), Some(unit_ns), "{per_ms}");
+            assert_eq!(unit_of_rows(&rows[..2]), None);
+        }
+        // In whole seconds many have the same.
+        let times: Vec<String> = (0..60).map(|n| (n / 20).to_string()).collect();
+        let mut rows: Vec<_> = times.iter().map(|time| (time.as_bytes(), &b"123"[..])).collect();
+        assert_eq!(unit_of_rows(&rows).map(|(unit_ns, _)| unit_ns), Some(NS_PER_S));
+        rows.push((b"3.5", b"123"));
+        assert_eq!(unit_of_rows(&rows), None);
     }
 }

@@ -169,3 +169,38 @@ fn lengths_that_lie_take_no_memory_and_end_nothing_before_them() {
         assert_eq!(issues.len(), usize::from(!is_fine), "{issues:?}");
     }
 }
+
+/// As `ros2 bag record` leaves it: a folder, with a new file whenever one is full. Without metadata, the files' numbers are their order.
+#[test]
+fn a_folder_with_several_files_is_one_trace() {
+    let folder = tempfile::tempdir().unwrap();
+    let one: Vec<_> = crate::open_source("a.mcap", THEIRS, &crate::ReadOptions::default()).unwrap().collect();
+    for number in [0, 1, 2] {
+        std::fs::write(folder.path().join(format!("bag_{number}.mcap")), THEIRS).unwrap();
+    }
+    let read = || {
+        let mut reader = crate::open_reader(folder.path(), &crate::ReadOptions::default()).unwrap();
+        let (mut records, mut batch) = (Vec::new(), Vec::new());
+        while let Some(read) = reader.next_batch(&mut batch) {
+            read.unwrap();
+            records.append(&mut batch);
+        }
+        let notes: Vec<_> = reader.notes().iter().map(|(what, _)| what).collect();
+        (records, notes.contains(&crate::ros::folder::NO_METADATA))
+    };
+    let one: Vec<_> = one.into_iter().map(Result::unwrap).collect();
+    assert_eq!(read(), ([one.clone(), one.clone(), one.clone()].concat(), true));
+    let metadata =
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n    - bag_0.mcap\n    - bag_1.mcap\n";
+    std::fs::write(folder.path().join("metadata.yaml"), metadata).unwrap();
+    assert_eq!(read(), ([one.clone(), one].concat(), false));
+    // Whatever is wrong in a file is said of that file.
+    std::fs::write(folder.path().join("bag_1.mcap"), &THEIRS[..THEIRS.len() / 2]).unwrap();
+    let mut reader = crate::open_reader(folder.path(), &crate::ReadOptions::default()).unwrap();
+    let issue = reader.find_map(Result::err).unwrap().to_string();
+    assert!(issue.contains("bag_1.mcap"), "{issue}");
+    std::fs::write(folder.path().join("metadata.yaml"), "relative_file_paths:\n  - ../other_0.mcap\n")
+        .unwrap();
+    let error = crate::open_reader(folder.path(), &crate::ReadOptions::default()).err().unwrap();
+    assert!(error.to_string().contains("a file outside of it"), "{error}");
+}

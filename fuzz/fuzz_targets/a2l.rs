@@ -1,4 +1,4 @@
-//! Descriptions of ECUs, and the values in any memory by them.
+//! A2lDescriptions of ECUs, and the values in any memory by them.
 
 #![no_main]
 

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{bail, ensure};
-use cantap_protocols::a2l::{Description, Descriptions};
+use cantap_protocols::a2l::{A2lDescriptions, Description};
 use cantap_protocols::calibration::{ByteOrder, Known, MasterSlave};
 use cantap_protocols::ccp::Ccp;
 use cantap_protocols::xcp::Xcp;
@@ -149,7 +149,7 @@ fn station(text: &str) -> Result<u16, String> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let paths: Vec<_> = args.a2l.iter().cloned().collect();
     let loaded = a2l::load(&paths, &stderr::reporter())?;
-    let description = match loaded.as_deref().map(Descriptions::all) {
+    let description = match loaded.as_deref().map(A2lDescriptions::all) {
         Some([only]) => Some(Arc::clone(only)),
         Some(several) => {
             return Err(usage(format!("there are {} ECUs in --a2l; give a file of one", several.len())));
@@ -162,7 +162,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     args.check(&targets)?;
     let device = args.speak.open()?;
     // What is read is described whatever identifiers the file has.
-    let descriptions = description.clone().map(|one| Arc::new(Descriptions::new(vec![one])));
+    let descriptions = description.clone().map(|one| Arc::new(A2lDescriptions::new(vec![one])));
     let known = |xcp, ccp| Known { xcp, ccp, descriptions: descriptions.clone() };
     let witness: Box<dyn Assembler> = match args.protocol {
         Spoken::Xcp => Box::new(Xcp::new(known(vec![options.parties], Vec::new()))),

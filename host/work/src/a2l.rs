@@ -1,11 +1,11 @@
-//! Descriptions of what is in ECUs' memories (A2L), as users name them.
+//! A2lDescriptions of what is in ECUs' memories (A2L), as users name them.
 
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use cantap_protocols::a2l::{Description, Descriptions};
+use cantap_protocols::a2l::{A2lDescriptions, Description};
 use cantap_trace::counted;
 
 use crate::report::Reporter;
@@ -49,7 +49,7 @@ pub fn read(path: &Path, reporter: &Reporter) -> anyhow::Result<Vec<Description>
 /// # Errors
 ///
 /// One cannot be read, or is no A2L.
-pub fn load(paths: &[PathBuf], reporter: &Reporter) -> anyhow::Result<Option<Arc<Descriptions>>> {
+pub fn load(paths: &[PathBuf], reporter: &Reporter) -> anyhow::Result<Option<Arc<A2lDescriptions>>> {
     if paths.is_empty() {
         return Ok(None);
     }
@@ -57,5 +57,5 @@ pub fn load(paths: &[PathBuf], reporter: &Reporter) -> anyhow::Result<Option<Arc
     for path in paths {
         all.extend(read(path, reporter)?.into_iter().map(Arc::new));
     }
-    Ok(Some(Arc::new(Descriptions::new(all))))
+    Ok(Some(Arc::new(A2lDescriptions::new(all))))
 }

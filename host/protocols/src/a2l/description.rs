@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 
-use super::if_data::{DaqEvent, Transport};
-use super::object::Object;
+use super::if_data::{DaqEvent, EcuConnection};
+use super::object::MemoryObject;
 use crate::Field;
 use crate::calibration::connection::MasterSlave;
 use crate::calibration::parts::ByteOrder;
@@ -18,24 +18,24 @@ const MOST_OF_ARRAY: u32 = 1 << 16;
 #[derive(Clone, Debug, Default)]
 pub struct Description {
     name: String,
-    objects: Vec<Object>,
+    objects: Vec<MemoryObject>,
     by_name: HashMap<String, usize>,
     /// Objects and which of their values, by extension and address.
     by_address: BTreeMap<(u8, u32), Vec<(usize, u32)>>,
     elements: usize,
-    transport: Transport,
+    transport: EcuConnection,
     /// What was not understood, in words.
     pub issues: Vec<String>,
 }
 
 impl Description {
     /// Of an ECU with this name and connection.
-    pub(super) fn new(name: String, transport: Transport) -> Self {
+    pub(super) fn new(name: String, transport: EcuConnection) -> Self {
         Self { name, transport, ..Self::default() }
     }
 
     /// Adds an object.
-    pub(super) fn add(&mut self, object: Object) {
+    pub(super) fn add(&mut self, object: MemoryObject) {
         let place = self.objects.len();
         let step = if object.is_text { object.size() } else { object.data_type.size() } as u32;
         let count = if object.is_text { 1 } else { object.count.min(MOST_OF_ARRAY) };
@@ -57,12 +57,12 @@ impl Description {
     }
 
     /// All objects, in the file's order.
-    pub fn objects(&self) -> &[Object] {
+    pub fn objects(&self) -> &[MemoryObject] {
         &self.objects
     }
 
     /// The object with this name; upper and lower case count only if there are two.
-    pub fn object(&self, name: &str) -> Option<&Object> {
+    pub fn object(&self, name: &str) -> Option<&MemoryObject> {
         if let Some(place) = self.by_name.get(name) {
             return self.objects.get(*place);
         }
@@ -133,11 +133,11 @@ impl Description {
 
 /// The descriptions of all ECUs on a bus.
 #[derive(Clone, Debug, Default)]
-pub struct Descriptions {
+pub struct A2lDescriptions {
     all: Vec<Arc<Description>>,
 }
 
-impl Descriptions {
+impl A2lDescriptions {
     /// These.
     pub fn new(all: Vec<Arc<Description>>) -> Self {
         Self { all }

@@ -20,7 +20,7 @@ pub struct DaqEvent {
 
 /// What an ECU's connection is like.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Transport {
+pub struct EcuConnection {
     /// XCP's identifiers.
     pub xcp: Option<MasterSlave>,
     /// CCP's identifiers.
@@ -136,7 +136,7 @@ fn period(cycle: i64, unit: i64) -> Option<f64> {
     (cycle > 0).then(|| cycle as f64 * 10_f64.powi(exponent))
 }
 
-impl Transport {
+impl EcuConnection {
     /// Takes an IF_DATA of a module.
     pub fn take(&mut self, data: &GenericIfData) {
         let mut tokens = Vec::new();

@@ -6,8 +6,8 @@ use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::conversion::{Conversion, Texts};
 use super::description::Description;
-use super::if_data::Transport;
-use super::object::{Bits, DataType, Object};
+use super::if_data::EcuConnection;
+use super::object::{Bits, DataType, MemoryObject};
 use crate::calibration::parts::ByteOrder;
 
 /// The largest file that is read, with what it includes, in bytes.
@@ -219,7 +219,7 @@ fn product(dimensions: Option<&a2lfile::MatrixDim>) -> Option<u32> {
 
 impl Loader<'_> {
     fn load(mut self) -> Description {
-        let mut transport = Transport::default();
+        let mut transport = EcuConnection::default();
         for data in self.module.if_data.iter().filter_map(|data| data.ifdata_items.as_ref()) {
             transport.take(data);
         }
@@ -264,7 +264,7 @@ impl Loader<'_> {
         }
     }
 
-    fn measurement(&mut self, from: &a2lfile::Measurement) -> Option<Object> {
+    fn measurement(&mut self, from: &a2lfile::Measurement) -> Option<MemoryObject> {
         let name = from.get_name();
         // Some are computed by the tool, and have no address.
         let address = from.ecu_address.as_ref()?.address;
@@ -280,7 +280,7 @@ impl Loader<'_> {
         let bits = bits_of(mask, from.bit_operation.as_ref());
         let (conversion, status, unit) = self.conversion(name, &from.conversion);
         let array = from.array_size.as_ref().map(|size| u32::from(size.number));
-        Some(Object {
+        Some(MemoryObject {
             name: shown(name),
             description: shown(&from.long_identifier),
             extension: from.ecu_address_extension.as_ref().map_or(0, |extension| extension.extension as u8),
@@ -298,7 +298,7 @@ impl Loader<'_> {
         })
     }
 
-    fn characteristic(&mut self, from: &a2lfile::Characteristic) -> Option<Object> {
+    fn characteristic(&mut self, from: &a2lfile::Characteristic) -> Option<MemoryObject> {
         let name = from.get_name();
         let is_text = from.characteristic_type == CharacteristicType::Ascii;
         let is_single = from.characteristic_type == CharacteristicType::Value;
@@ -329,7 +329,7 @@ impl Loader<'_> {
         let (conversion, status, unit) = self.conversion(name, &from.conversion);
         let number = from.number.as_ref().map(|number| u32::from(number.number));
         let count = if is_single { None } else { product(from.matrix_dim.as_ref()).or(number) };
-        Some(Object {
+        Some(MemoryObject {
             name: shown(name),
             description: shown(&from.long_identifier),
             extension: from.ecu_address_extension.as_ref().map_or(0, |extension| extension.extension as u8),

@@ -1,4 +1,4 @@
-//! Descriptions of what is in an ECU's memory: A2L files (ASAM MCD-2 MC, versions 1.31 to 1.71).
+//! A2lDescriptions of what is in an ECU's memory: A2L files (ASAM MCD-2 MC, versions 1.31 to 1.71).
 //!
 //! Read are measured values (MEASUREMENT) and parameters (CHARACTERISTIC: values, blocks of values, text) with their conversions, and, of
 //! IF_DATA, the identifiers and events of XCP and CCP. Formulas, curves, maps and the structures of version 1.7 are left out, and listed.
@@ -12,24 +12,24 @@ mod object;
 mod tests;
 
 pub use conversion::{Conversion, Meaning, Texts};
-pub use description::{Description, Descriptions};
-pub use if_data::{DaqEvent, Transport};
+pub use description::{A2lDescriptions, Description};
+pub use if_data::{DaqEvent, EcuConnection};
 pub use load::{A2lError, Include};
-pub use object::{Bits, DataType, Object, ValueError};
+pub use object::{Bits, DataType, MemoryObject, ValueError};
 
 use crate::Field;
-use crate::calibration::lists::Entry;
+use crate::calibration::lists::ListEntry;
 use crate::calibration::parts::ByteOrder;
 
 /// Appends what an entry of a list contains: the description's values, or its bytes under its address.
 pub(crate) fn push_entry(
     fields: &mut Vec<Field>,
     description: Option<&Description>,
-    entry: Entry,
+    entry: ListEntry,
     bytes: &[u8],
     order: Option<ByteOrder>,
 ) {
-    let Entry { extension, address, bit, .. } = entry;
+    let ListEntry { extension, address, bit, .. } = entry;
     let named = description.filter(|_| bit.is_none());
     let named = named.map(|description| description.entry_fields(extension, address, bytes, order));
     match (named.filter(|named| !named.is_empty()), bit, extension) {

@@ -37,7 +37,7 @@ pub struct Bits {
 
 /// A value in the memory.
 #[derive(Clone, Debug)]
-pub struct Object {
+pub struct MemoryObject {
     /// Its name.
     pub name: String,
     /// What it is, in words.
@@ -92,7 +92,7 @@ pub enum ValueError {
     NoOrder,
 }
 
-impl Object {
+impl MemoryObject {
     /// Bytes of all of it.
     pub const fn size(&self) -> usize {
         let count = self.count as usize;
@@ -272,8 +272,8 @@ fn half(bits: u16) -> f64 {
 mod tests {
     use super::*;
 
-    fn object(data_type: DataType, conversion: Conversion) -> Object {
-        Object {
+    fn object(data_type: DataType, conversion: Conversion) -> MemoryObject {
+        MemoryObject {
             name: "N".to_owned(),
             description: String::new(),
             extension: 0,
@@ -291,7 +291,7 @@ mod tests {
         }
     }
 
-    fn text(object: &Object, bytes: &[u8]) -> String {
+    fn text(object: &MemoryObject, bytes: &[u8]) -> String {
         object.field(0, bytes, Some(ByteOrder::Little)).to_string()
     }
 
@@ -305,7 +305,7 @@ mod tests {
             "N 1.5 rpm"
         );
         assert_eq!(text(&object(DataType::Float(2), Conversion::Identical), &[0x00, 0x3E]), "N 1.5 rpm");
-        let order = Object { order: Some(ByteOrder::Big), ..speed };
+        let order = MemoryObject { order: Some(ByteOrder::Big), ..speed };
         assert_eq!(text(&order, &[0x27, 0x10]), "N 2500 rpm");
     }
 

@@ -1,4 +1,4 @@
-//! Descriptions as tools write them.
+//! A2lDescriptions as tools write them.
 
 use super::*;
 
@@ -127,11 +127,11 @@ fn a_wrong_grammar_of_if_data_or_a_missing_file_is_no_obstacle() {
 
 #[test]
 fn a_description_is_that_of_its_identifiers() {
-    let all = Descriptions::new(vec![ecu().into()]);
+    let all = A2lDescriptions::new(vec![ecu().into()]);
     assert!(all.of("7F0:18FF0002".parse().unwrap()).is_some());
     assert!(all.of("7F0:7F1".parse().unwrap()).is_none());
     let bare =
         Description::parse(&ECU.replace("XCP_ON_CAN", "XCP_ON_TCP").replace("TP_BLOB", "BLOB")).unwrap();
-    let all = Descriptions::new(bare.into_iter().map(Into::into).collect());
+    let all = A2lDescriptions::new(bare.into_iter().map(Into::into).collect());
     assert!(all.of("7F0:7F1".parse().unwrap()).is_some(), "the only one, which says nothing else");
 }

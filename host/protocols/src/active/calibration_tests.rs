@@ -1,5 +1,6 @@
 //! Commands to slaves that answer, do not, or answer what they should not.
 
+use super::Machine as _;
 use super::calibration::{CalibrationCommand, CommandError, CommandRequest, Dialect};
 use super::testing::{Peer, arrives, disturbed, run};
 use crate::serving::xcp::{Memory, XcpServer};
@@ -102,7 +103,6 @@ fn a_command_that_is_no_frame_ends_at_once() {
 #[test]
 fn another_master_is_noticed() {
     let mut machine = CalibrationCommand::new(request(XCP, &[0xFD], 0));
-    use super::Machine as _;
     assert!(machine.next(0).is_some());
     machine.sent(1);
     machine.hear(2, Id::standard_truncated(0x7F0), &[0xFF, 0]);

@@ -9,7 +9,7 @@ use rustc_hash::FxHashMap;
 use super::connection::{MasterSlave, is_short_gap};
 use super::finding::{ConnectionFinder, Sign};
 use super::known::Known;
-use crate::a2l::{Description, Descriptions};
+use crate::a2l::{A2lDescriptions, Description};
 use crate::{Assembler, Event};
 
 /// The most connections that are followed.
@@ -58,7 +58,7 @@ enum Side {
 #[derive(Debug)]
 pub struct Connections<C: Connection> {
     known: Vec<MasterSlave>,
-    descriptions: Option<Arc<Descriptions>>,
+    descriptions: Option<Arc<A2lDescriptions>>,
     finder: C::Finder,
     /// By channel and number.
     all: BTreeMap<(u8, usize), C>,

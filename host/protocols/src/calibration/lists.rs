@@ -11,7 +11,7 @@ const MOST_LISTS: usize = 1024;
 
 /// Something that is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Entry {
+pub struct ListEntry {
     /// The address extension.
     pub extension: u8,
     /// The address.
@@ -26,7 +26,7 @@ pub struct Entry {
 #[derive(Clone, Debug, Default)]
 pub struct List {
     /// The entries of each packet; `None` where one has room and was not written.
-    odts: Vec<Vec<Option<Entry>>>,
+    odts: Vec<Vec<Option<ListEntry>>>,
     /// Its mode, as it was set.
     pub mode: Option<u8>,
     /// The event that it is sampled with.
@@ -55,7 +55,7 @@ impl List {
     }
 
     /// What a packet contains, in order, if all of it is known.
-    pub fn packet(&self, odt: u8) -> Option<&[Option<Entry>]> {
+    pub fn packet(&self, odt: u8) -> Option<&[Option<ListEntry>]> {
         let entries = self.odts.get(usize::from(odt))?;
         let used = entries.iter().take_while(|entry| entry.is_some()).count();
         let (used, rest) = entries.split_at(used);
@@ -146,7 +146,7 @@ impl Lists {
     }
 
     /// Writes an entry where the pointer is, and moves that on.
-    pub fn write(&mut self, entry: Entry) {
+    pub fn write(&mut self, entry: ListEntry) {
         let Some((number, odt, place)) = self.pointer else { return };
         self.pointer = place.checked_add(1).map(|next| (number, odt, next));
         let has_room = self.entries < MOST_ENTRIES && usize::from(odt) < MOST_ODTS;
@@ -171,8 +171,8 @@ impl Lists {
 mod tests {
     use super::*;
 
-    fn entry(address: u32) -> Entry {
-        Entry { extension: 0, address, size: 2, bit: None }
+    fn entry(address: u32) -> ListEntry {
+        ListEntry { extension: 0, address, size: 2, bit: None }
     }
 
     #[test]

@@ -36,7 +36,7 @@ impl ByteOrder {
 
 /// A part of a command or of a response.
 #[derive(Clone, Copy, Debug)]
-pub enum Part {
+pub enum PacketPart {
     /// Bytes that mean nothing.
     Skip(usize),
     /// A number of so many bytes, written in decimal.
@@ -49,6 +49,19 @@ pub enum Part {
     Bits(&'static str, &'static [(u8, &'static str)]),
     /// All that follows, as it is.
     Rest(&'static str),
+}
+
+/// A command of XCP or CCP.
+#[derive(Debug)]
+pub struct CommandDefinition {
+    /// Its first byte.
+    pub code: u8,
+    /// Its name in the standard.
+    pub name: &'static str,
+    /// What follows in a command: the first byte, and CCP's counter, are not among it.
+    pub request: &'static [PacketPart],
+    /// What follows in an answer that agrees: the packet identifier, and CCP's return code and counter, are not among it.
+    pub response: &'static [PacketPart],
 }
 
 /// The names of the bits of a byte that are set, each a mask.
@@ -65,32 +78,32 @@ pub fn name_in(table: &[(u8, &'static str)], number: u8) -> Option<&'static str>
 
 /// Appends the fields that these parts name. Where the order of bytes is not known, numbers of more than one byte are bytes. Parts that are
 /// not there are left out.
-pub fn push_parts(fields: &mut Vec<Field>, parts: &[Part], mut data: &[u8], order: Option<ByteOrder>) {
+pub fn push_parts(fields: &mut Vec<Field>, parts: &[PacketPart], mut data: &[u8], order: Option<ByteOrder>) {
     for part in parts {
         let size = match *part {
-            Part::Skip(size) | Part::Number(_, size) | Part::Hex(_, size) => size,
-            Part::Named(..) | Part::Bits(..) => 1,
-            Part::Rest(_) => data.len(),
+            PacketPart::Skip(size) | PacketPart::Number(_, size) | PacketPart::Hex(_, size) => size,
+            PacketPart::Named(..) | PacketPart::Bits(..) => 1,
+            PacketPart::Rest(_) => data.len(),
         };
         let Some((bytes, rest)) = data.split_at_checked(size) else { return };
         data = rest;
         let order = if size == 1 { Some(ByteOrder::Little) } else { order };
         match (*part, order) {
-            (Part::Skip(_), _) => {}
-            (Part::Rest(_), _) if bytes.is_empty() => {}
-            (Part::Number(name, _), Some(order)) => {
+            (PacketPart::Skip(_), _) => {}
+            (PacketPart::Rest(_), _) if bytes.is_empty() => {}
+            (PacketPart::Number(name, _), Some(order)) => {
                 fields.push(Field::number(name, order.number(bytes) as i64));
             }
-            (Part::Hex(name, size), Some(order)) => {
+            (PacketPart::Hex(name, size), Some(order)) => {
                 fields.push(Field::hex(name, order.number(bytes), 2 * size as u8));
             }
-            (Part::Named(name, names), _) => {
+            (PacketPart::Named(name, names), _) => {
                 fields.push(Field::hex(name, bytes[0], 2).meaning(name_in(names, bytes[0])));
             }
-            (Part::Bits(name, names), _) => {
+            (PacketPart::Bits(name, names), _) => {
                 fields.push(Field::hex(name, bytes[0], 2).meaning(bit_names(bytes[0], names).map(Cow::from)));
             }
-            (Part::Number(name, _) | Part::Hex(name, _) | Part::Rest(name), _) => {
+            (PacketPart::Number(name, _) | PacketPart::Hex(name, _) | PacketPart::Rest(name), _) => {
                 fields.push(Field::bytes(name, bytes));
             }
         }
@@ -112,7 +125,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_read_stays_bytes_and_what_is_missing_is_left_out() {
-        let parts = [Part::Number("a", 1), Part::Hex("b", 2), Part::Number("c", 4)];
+        let parts = [PacketPart::Number("a", 1), PacketPart::Hex("b", 2), PacketPart::Number("c", 4)];
         let mut fields = Vec::new();
         push_parts(&mut fields, &parts, &[7, 0x12, 0x34], None);
         let text: Vec<_> = fields.iter().map(ToString::to_string).collect();

@@ -2,8 +2,8 @@
 //!
 //! A station's address is sent with its lowest byte first; in which order all other numbers are, is the ECU's own matter.
 
-use crate::calibration::parts::Part::{self, Bits, Hex, Named, Number, Rest, Skip};
-use crate::calibration::parts::name_in;
+use crate::calibration::parts::PacketPart::{self, Bits, Hex, Named, Number, Rest, Skip};
+use crate::calibration::parts::{CommandDefinition, name_in};
 
 /// Packet identifier of the answer to a command.
 pub const COMMAND_RETURN: u8 = 0xFF;
@@ -31,26 +31,13 @@ pub mod command {
     pub const DNLOAD_6: u8 = 0x23;
 }
 
-/// A command.
-#[derive(Debug)]
-pub struct Command {
-    /// Its first byte.
-    pub code: u8,
-    /// Its name in the standard.
-    pub name: &'static str,
-    /// What follows the first byte and the counter.
-    pub request: &'static [Part],
-    /// What follows return code and counter in the answer.
-    pub response: &'static [Part],
-}
-
 const fn command(
     code: u8,
     name: &'static str,
-    request: &'static [Part],
-    response: &'static [Part],
-) -> Command {
-    Command { code, name, request, response }
+    request: &'static [PacketPart],
+    response: &'static [PacketPart],
+) -> CommandDefinition {
+    CommandDefinition { code, name, request, response }
 }
 
 /// Resources, as in the response to EXCHANGE_ID, seeds and keys.
@@ -62,12 +49,12 @@ const SESSION: &[(u8, &str)] = &[
     (0x40, "store"),
     (0x80, "running"),
 ];
-const ADDRESS: &[Part] = &[Number("mta", 1), Number("extension", 1), Hex("address", 4)];
-const NEXT: &[Part] = &[Number("next_extension", 1), Hex("next_address", 4)];
-const COUNT: &[Part] = &[Number("elements", 1)];
+const ADDRESS: &[PacketPart] = &[Number("mta", 1), Number("extension", 1), Hex("address", 4)];
+const NEXT: &[PacketPart] = &[Number("next_extension", 1), Hex("next_address", 4)];
+const COUNT: &[PacketPart] = &[Number("elements", 1)];
 
 /// All commands.
-pub const COMMANDS: &[Command] = &[
+pub const COMMANDS: &[CommandDefinition] = &[
     command(command::CONNECT, "CONNECT", &[Hex("station", 2)], &[]),
     command(command::SET_MTA, "SET_MTA", ADDRESS, &[]),
     command(command::DNLOAD, "DNLOAD", COUNT, NEXT),
@@ -165,7 +152,7 @@ pub const COMMANDS: &[Command] = &[
 ];
 
 /// The command with this code.
-pub fn find(code: u8) -> Option<&'static Command> {
+pub fn find(code: u8) -> Option<&'static CommandDefinition> {
     COMMANDS.iter().find(|command| command.code == code)
 }
 

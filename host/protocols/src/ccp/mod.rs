@@ -12,4 +12,4 @@ mod slave;
 mod tests;
 
 /// Decodes CCP.
-pub type Ccp = crate::calibration::Connections<slave::Slave>;
+pub type Ccp = crate::calibration::Connections<slave::CcpConnection>;

@@ -11,7 +11,7 @@ use crate::a2l::Description;
 use crate::calibration::Connection;
 use crate::calibration::connection::{MasterSlave, Waiting, no_response, slave_event, unasked};
 use crate::calibration::known::Known;
-use crate::calibration::lists::{Entry, Lists};
+use crate::calibration::lists::{ListEntry, Lists};
 use crate::calibration::parts::{ByteOrder, push_parts};
 use crate::{Bytes, Event, EventKind, Field, Protocol, Trouble};
 
@@ -21,7 +21,7 @@ const LONG_RESPONSE_NS: i64 = 30_000_000_000;
 
 /// A slave, as far as its connection was heard.
 #[derive(Clone, Debug)]
-pub struct Slave {
+pub struct CcpConnection {
     parties: MasterSlave,
     description: Option<Arc<Description>>,
     mta: Option<(u8, u32)>,
@@ -31,7 +31,7 @@ pub struct Slave {
     daq_id: Option<Id>,
 }
 
-impl Connection for Slave {
+impl Connection for CcpConnection {
     type Finder = SessionFinder;
 
     fn new(parties: MasterSlave, description: Option<Arc<Description>>) -> Self {
@@ -103,7 +103,7 @@ impl Connection for Slave {
     }
 }
 
-impl Slave {
+impl CcpConnection {
     /// The order of the ECU's bytes, if a description has it. Without one, addresses are shown as they are sent.
     fn order(&self) -> Option<ByteOrder> {
         self.description.as_ref().and_then(|description| description.ccp_order())
@@ -231,7 +231,7 @@ impl Slave {
             command::SET_DAQ_PTR => self.lists.point_to(daq, byte(3), byte(4)),
             command::WRITE_DAQ => {
                 if let Some((extension, address)) = self.address_in(asked, 3) {
-                    self.lists.write(Entry { extension, address, size: usize::from(byte(2)), bit: None });
+                    self.lists.write(ListEntry { extension, address, size: usize::from(byte(2)), bit: None });
                 }
             }
             command::START_STOP => {
@@ -264,7 +264,8 @@ impl Slave {
         let mut event = slave_event(Protocol::Ccp, record, self.parties, EventKind::Periodic, "DAQ");
         let found = self.lists.of_pid(data[0]);
         let packet = found.and_then(|(daq, odt, list)| Some((daq, odt, list.packet(odt)?)));
-        let used = |packet: &[Option<Entry>]| packet.iter().flatten().map(|entry| entry.size).sum::<usize>();
+        let used =
+            |packet: &[Option<ListEntry>]| packet.iter().flatten().map(|entry| entry.size).sum::<usize>();
         let Some((daq, odt, packet)) = packet.filter(|(_, _, packet)| used(packet) < data.len()) else {
             event.fields.push(Field::hex("pid", data[0], 2));
             event.fields.push(Field::bytes("data", &data[1..]));

@@ -3,7 +3,7 @@
 //! It has two lists of three packets each. It neither programs nor has pages, and nothing of it needs a key.
 
 use super::xcp::Memory;
-use crate::calibration::lists::{Entry, Lists};
+use crate::calibration::lists::{ListEntry, Lists};
 use crate::calibration::parts::ByteOrder;
 use crate::ccp::codec::{COMMAND_RETURN, command};
 
@@ -160,7 +160,7 @@ impl CcpServer {
                 if !matches!(size, 1 | 2 | 4) || memory.read(extension, address, size).is_none() {
                     return Err(OUT_OF_RANGE);
                 }
-                self.lists.write(Entry { extension, address, size, bit: None });
+                self.lists.write(ListEntry { extension, address, size, bit: None });
                 Ok(Vec::new())
             }
             command::START_STOP => {

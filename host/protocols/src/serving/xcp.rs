@@ -3,7 +3,7 @@
 //! Lists are dynamic, their packets have absolute identifiers, and stamps of four bytes in microseconds where a master asks for them. It
 //! neither programs nor stimulates, and has no pages.
 
-use crate::calibration::lists::{Entry, Lists};
+use crate::calibration::lists::{ListEntry, Lists};
 use crate::calibration::parts::ByteOrder;
 use crate::xcp::codec::{ERR, LEAST_COMMAND, RES, command, error};
 
@@ -251,7 +251,7 @@ impl XcpServer {
                 if size == 0 || size > 7 || memory.read(extension, address, size).is_none() {
                     return Err(error::OUT_OF_RANGE);
                 }
-                self.lists.write(Entry { extension, address, size, bit: None });
+                self.lists.write(ListEntry { extension, address, size, bit: None });
                 Ok(Vec::new())
             }
             command::SET_DAQ_LIST_MODE => {

@@ -1,7 +1,7 @@
 //! The packets of XCP (ASAM MCD-1 XCP 1.5, protocol layer): identifiers, commands with their parts, errors, events, services.
 
-use crate::calibration::parts::Part::{self, Bits, Hex, Named, Number, Rest, Skip};
-use crate::calibration::parts::name_in;
+use crate::calibration::parts::PacketPart::{self, Bits, Hex, Named, Number, Rest, Skip};
+use crate::calibration::parts::{CommandDefinition, name_in};
 
 /// Packet identifier of a positive response.
 pub const RES: u8 = 0xFF;
@@ -76,26 +76,13 @@ pub const EV_CMD_PENDING: u8 = 0x05;
 /// Code of the event with which the slave ends the session.
 pub const EV_SESSION_TERMINATED: u8 = 0x07;
 
-/// A command.
-#[derive(Debug)]
-pub struct Command {
-    /// Its first byte.
-    pub code: u8,
-    /// Its name in the standard.
-    pub name: &'static str,
-    /// What follows the first byte.
-    pub request: &'static [Part],
-    /// What follows the first byte of a positive response.
-    pub response: &'static [Part],
-}
-
 const fn command(
     code: u8,
     name: &'static str,
-    request: &'static [Part],
-    response: &'static [Part],
-) -> Command {
-    Command { code, name, request, response }
+    request: &'static [PacketPart],
+    response: &'static [PacketPart],
+) -> CommandDefinition {
+    CommandDefinition { code, name, request, response }
 }
 
 /// Resources, as in CONNECT's response, protection, seeds and keys.
@@ -163,13 +150,14 @@ const CHECKSUMS: &[(u8, &str)] = &[
     (9, "CRC-32"),
     (0xFF, "user defined"),
 ];
-const ADDRESS: &[Part] = &[Skip(2), Number("extension", 1), Hex("address", 4)];
-const COUNTED_ADDRESS: &[Part] = &[Number("elements", 1), Skip(1), Number("extension", 1), Hex("address", 4)];
-const COUNT: &[Part] = &[Number("elements", 1)];
-const LIST: &[Part] = &[Skip(1), Number("daq", 2)];
+const ADDRESS: &[PacketPart] = &[Skip(2), Number("extension", 1), Hex("address", 4)];
+const COUNTED_ADDRESS: &[PacketPart] =
+    &[Number("elements", 1), Skip(1), Number("extension", 1), Hex("address", 4)];
+const COUNT: &[PacketPart] = &[Number("elements", 1)];
+const LIST: &[PacketPart] = &[Skip(1), Number("daq", 2)];
 
 /// All commands.
-pub const COMMANDS: &[Command] = &[
+pub const COMMANDS: &[CommandDefinition] = &[
     command(
         command::CONNECT,
         "CONNECT",
@@ -407,7 +395,7 @@ pub const COMMANDS: &[Command] = &[
 ];
 
 /// The command with this code.
-pub fn find(code: u8) -> Option<&'static Command> {
+pub fn find(code: u8) -> Option<&'static CommandDefinition> {
     COMMANDS.iter().find(|command| command.code == code)
 }
 

@@ -1,7 +1,7 @@
 //! What data packets (DTOs) contain, by the lists that a master has set up.
 
 use crate::Field;
-use crate::calibration::lists::{Entry, List, Lists};
+use crate::calibration::lists::{List, ListEntry, Lists};
 use crate::calibration::parts::ByteOrder;
 
 /// Bits of a list's mode.
@@ -58,7 +58,7 @@ pub struct Packet<'a> {
     /// The stamp's bytes.
     pub stamp: Option<&'a [u8]>,
     /// What it contains.
-    pub entries: Vec<(Entry, &'a [u8])>,
+    pub entries: Vec<(ListEntry, &'a [u8])>,
 }
 
 impl PacketLayout {

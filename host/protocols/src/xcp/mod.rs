@@ -14,4 +14,4 @@ mod state;
 mod tests;
 
 /// Decodes XCP.
-pub type Xcp = crate::calibration::Connections<slave::Slave>;
+pub type Xcp = crate::calibration::Connections<slave::XcpConnection>;

@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use cantap_trace::{Id, TraceRecord};
 
-use super::codec::{self, Command, EV_CMD_PENDING, EV_SESSION_TERMINATED, LEAST_COMMAND, command};
+use super::codec::{self, EV_CMD_PENDING, EV_SESSION_TERMINATED, LEAST_COMMAND, command};
 use super::signs::ConnectFinder;
 use super::state::State;
 use crate::a2l::Description;
 use crate::calibration::Connection;
 use crate::calibration::connection::{MasterSlave, Waiting, no_response, slave_event, unasked};
 use crate::calibration::known::Known;
-use crate::calibration::parts::{ByteOrder, push_parts};
+use crate::calibration::parts::{ByteOrder, CommandDefinition, push_parts};
 use crate::{Event, EventKind, Field, Protocol, Trouble};
 
 /// How long an answer may take: the time-outs are the slave's own, and rarely more than this.
@@ -25,7 +25,7 @@ const MOST_WAITING: usize = 16;
 
 /// A slave, as far as its connection was heard.
 #[derive(Clone, Debug)]
-pub struct Slave {
+pub struct XcpConnection {
     parties: MasterSlave,
     description: Option<Arc<Description>>,
     state: State,
@@ -46,7 +46,7 @@ const fn continues(code: u8) -> Option<u8> {
     }
 }
 
-impl Connection for Slave {
+impl Connection for XcpConnection {
     type Finder = ConnectFinder;
 
     fn new(parties: MasterSlave, description: Option<Arc<Description>>) -> Self {
@@ -181,7 +181,7 @@ impl Connection for Slave {
     }
 }
 
-impl Slave {
+impl XcpConnection {
     fn slave_event(&mut self, record: &TraceRecord, rest: &[u8], events: &mut Vec<Event>) {
         let code = rest.first().copied().unwrap_or_default();
         if code == EV_CMD_PENDING
@@ -255,7 +255,9 @@ impl Slave {
         event.fields.push(Field::hex("command", code, 2));
         let data = &waiting.command[1..];
         match known {
-            Some(Command { request, .. }) => push_parts(&mut event.fields, request, data, self.state.order),
+            Some(CommandDefinition { request, .. }) => {
+                push_parts(&mut event.fields, request, data, self.state.order);
+            }
             None if data.is_empty() => {}
             None => event.fields.push(Field::bytes("parameters", data)),
         }

@@ -4,7 +4,7 @@ use cantap_trace::Id;
 
 use super::codec::command;
 use super::daq::PacketLayout;
-use crate::calibration::lists::{Entry, Lists};
+use crate::calibration::lists::{ListEntry, Lists};
 use crate::calibration::parts::ByteOrder;
 
 /// The state of a connection.
@@ -54,8 +54,8 @@ impl State {
         Some(self.order?.number(command.get(at..at + 2)?) as u16)
     }
 
-    fn entry_of(&self, bit: u8, size: u8, extension: u8, address: &[u8]) -> Option<Entry> {
-        Some(Entry {
+    fn entry_of(&self, bit: u8, size: u8, extension: u8, address: &[u8]) -> Option<ListEntry> {
+        Some(ListEntry {
             extension,
             address: self.order?.number(address) as u32,
             size: usize::from(size) * self.granularity,
@@ -64,7 +64,7 @@ impl State {
     }
 
     /// The entries of WRITE_DAQ_MULTIPLE.
-    pub fn entries_of<'a>(&'a self, command: &'a [u8]) -> impl Iterator<Item = Entry> + 'a {
+    pub fn entries_of<'a>(&'a self, command: &'a [u8]) -> impl Iterator<Item = ListEntry> + 'a {
         let count = usize::from(command.get(1).copied().unwrap_or_default());
         let all = command.get(2..).unwrap_or_default().chunks(8).take(count);
         all.filter_map(|bytes| match *bytes {

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use cantap_protocols::dsdl::{DataTypes, Source};
+use cantap_protocols::dsdl::{DataTypes, DsdlSource};
 
 use crate::report::Reporter;
 
@@ -43,7 +43,7 @@ impl FromStr for SubjectType {
 /// # Errors
 ///
 /// Whatever keeps a folder or a definition from being read; more than 20 000 of them, or one of more than 1 MiB.
-pub fn read_folder(folder: &Path) -> io::Result<Vec<Source>> {
+pub fn read_folder(folder: &Path) -> io::Result<Vec<DsdlSource>> {
     let (mut sources, mut folders) = (Vec::new(), vec![(folder.to_owned(), String::new())]);
     while let Some((folder, namespace)) = folders.pop() {
         for entry in std::fs::read_dir(&folder)? {
@@ -52,13 +52,13 @@ pub fn read_folder(folder: &Path) -> io::Result<Vec<Source>> {
             let (kind, path) = (entry.file_type()?, format!("{namespace}{name}"));
             if kind.is_dir() && !name.starts_with('.') {
                 folders.push((entry.path(), format!("{path}/")));
-            } else if kind.is_file() && Source::has_name(&name) {
+            } else if kind.is_file() && DsdlSource::has_name(&name) {
                 if sources.len() == MOST_FILES || entry.metadata()?.len() > MOST_BYTES {
                     let what = format!("{}: too many or too long definitions", entry.path().display());
                     return Err(io::Error::other(what));
                 }
                 let text = String::from_utf8_lossy(&std::fs::read(entry.path())?).into_owned();
-                sources.push(Source { path, text });
+                sources.push(DsdlSource { path, text });
             }
         }
     }

@@ -2,14 +2,14 @@
 
 use std::fmt::Write as _;
 
-use super::parse::{Source, constant};
+use super::parse::{DsdlSource, constant};
 use super::unit;
 
 const MARK: &str = "=== ";
 
 /// The definitions in one text, in the order of their paths: without empty lines, assertions, and comments but for units. This is how those that
 /// are built in were made.
-pub fn condensed(sources: &[Source]) -> String {
+pub fn condensed(sources: &[DsdlSource]) -> String {
     let mut sources: Vec<_> = sources.iter().collect();
     sources.sort_by(|a, b| a.path.cmp(&b.path));
     let mut text = String::new();
@@ -34,7 +34,7 @@ pub fn condensed(sources: &[Source]) -> String {
 }
 
 /// The definitions of such a text; lines before the first are comments.
-pub fn split(text: &str) -> impl Iterator<Item = Source> + '_ {
+pub fn split(text: &str) -> impl Iterator<Item = DsdlSource> + '_ {
     let starts_file = |line: &str| line.strip_prefix(MARK).map(str::to_owned);
     let mut lines = text.lines().skip_while(move |line| starts_file(line).is_none()).peekable();
     std::iter::from_fn(move || {
@@ -44,6 +44,6 @@ pub fn split(text: &str) -> impl Iterator<Item = Source> + '_ {
             text.push_str(line);
             text.push('\n');
         }
-        Some(Source { path, text })
+        Some(DsdlSource { path, text })
     })
 }

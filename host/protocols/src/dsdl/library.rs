@@ -5,7 +5,7 @@ use rustc_hash::FxHashMap;
 use super::expression::evaluate;
 use super::meaning;
 use super::model::{Definition, Generation, Kind, Member, Section, Size, bits_for};
-use super::parse::{Raw, RawField, Source, parse};
+use super::parse::{DsdlSource, Raw, RawField, parse};
 use super::signature::Signature;
 use super::unit;
 
@@ -56,7 +56,7 @@ struct Building<'a> {
 
 impl Library {
     /// Of these sources, of which the first with a name counts. Appends what is not understood.
-    pub fn of(generation: Generation, sources: &[Source], problems: &mut Vec<String>) -> Self {
+    pub fn of(generation: Generation, sources: &[DsdlSource], problems: &mut Vec<String>) -> Self {
         let (mut raws, mut names) = (Vec::<Raw>::new(), FxHashMap::<String, usize>::default());
         for source in sources {
             match parse(source, generation) {

@@ -20,7 +20,7 @@ mod unit;
 
 pub use condensed::condensed;
 pub(crate) use model::{Definition, Generation, Section};
-pub use parse::Source;
+pub use parse::DsdlSource;
 pub(crate) use read::{Unread, read};
 pub(crate) use signature::crc16;
 pub use types::{DataTypes, UnknownType};

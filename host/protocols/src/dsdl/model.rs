@@ -11,7 +11,7 @@ pub(crate) enum Generation {
 
 /// A message type, or a service with its two messages.
 #[derive(Clone, Debug, Default)]
-pub struct Definition {
+pub(crate) struct Definition {
     /// Its full name; Cyphal's with the version: `uavcan.node.Heartbeat.1.0`.
     pub name: String,
     /// Its own data type, subject or service number, if it has one.
@@ -28,7 +28,7 @@ pub struct Definition {
 
 /// The fields of a message.
 #[derive(Clone, Debug, Default)]
-pub struct Section {
+pub(crate) struct Section {
     /// Only one of the fields is there.
     pub is_union: bool,
     /// Its length does not stand before it where it is nested (Cyphal).
@@ -41,7 +41,7 @@ pub struct Section {
 
 /// A field.
 #[derive(Clone, Debug)]
-pub struct Member {
+pub(crate) struct Member {
     /// Its name; empty for a void.
     pub name: String,
     /// How it is read.
@@ -56,7 +56,7 @@ pub struct Member {
 
 /// How a field is read.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Kind {
+pub(crate) enum Kind {
     /// This many bits without meaning.
     Void(u8),
     /// One bit.
@@ -77,7 +77,7 @@ pub enum Kind {
 
 /// How many elements an array has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Size {
+pub(crate) enum Size {
     /// Always so many.
     Fixed(u32),
     /// At most so many; their number stands before them.

@@ -4,7 +4,7 @@ use super::model::Generation;
 
 /// A file of definitions.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Source {
+pub struct DsdlSource {
     /// Its path from the folder of the outermost namespace on, with `/`: `uavcan/protocol/341.NodeStatus.uavcan`.
     pub path: String,
     /// Its content.
@@ -13,7 +13,7 @@ pub struct Source {
 
 /// What a path says.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Name {
+pub(crate) struct Name {
     /// Without the type's own name: `uavcan.protocol`.
     pub namespace: String,
     /// With it, and with the version of one of Cyphal's.
@@ -24,7 +24,7 @@ pub struct Name {
 
 /// A definition whose types are still text.
 #[derive(Clone, Debug, Default)]
-pub struct Raw {
+pub(crate) struct Raw {
     pub name: Name,
     /// One, or two of a service.
     pub sections: Vec<RawSection>,
@@ -32,7 +32,7 @@ pub struct Raw {
 }
 
 #[derive(Clone, Debug, Default)]
-pub struct RawSection {
+pub(crate) struct RawSection {
     pub is_union: bool,
     pub is_sealed: bool,
     pub fields: Vec<RawField>,
@@ -41,7 +41,7 @@ pub struct RawSection {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RawField {
+pub(crate) struct RawField {
     pub line: usize,
     pub is_truncated: bool,
     /// Without what stands in brackets.
@@ -53,7 +53,7 @@ pub struct RawField {
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RawArray {
+pub(crate) struct RawArray {
     pub is_variable: bool,
     /// Its expression is one more than the most.
     pub is_below: bool,
@@ -70,7 +70,7 @@ impl RawArray {
     }
 }
 
-impl Source {
+impl DsdlSource {
     /// Whether the name of a file is that of a definition.
     pub fn has_name(name: &str) -> bool {
         generation_of(name).is_some()
@@ -116,7 +116,7 @@ fn name_of(path: &str, generation: Generation) -> Option<Name> {
 }
 
 /// Reads a definition. What cannot be understood is an error, in words with its line.
-pub fn parse(source: &Source, generation: Generation) -> Result<Raw, String> {
+pub(crate) fn parse(source: &DsdlSource, generation: Generation) -> Result<Raw, String> {
     let wrong = |line: usize, what: &str| format!("{}: line {line}: {what}", source.path);
     let name = name_of(&source.path, generation)
         .ok_or_else(|| format!("{}: its name is not that of a data type", source.path))?;

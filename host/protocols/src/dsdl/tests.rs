@@ -2,8 +2,10 @@ use super::library::Library;
 use super::*;
 
 fn of(generation: Generation, sources: &[(&str, &str)]) -> (Library, Vec<String>) {
-    let sources: Vec<_> =
-        sources.iter().map(|(path, text)| Source { path: (*path).into(), text: (*text).into() }).collect();
+    let sources: Vec<_> = sources
+        .iter()
+        .map(|(path, text)| DsdlSource { path: (*path).into(), text: (*text).into() })
+        .collect();
     let mut problems = Vec::new();
     let library = Library::of(generation, &sources, &mut problems);
     (library, problems)
@@ -87,7 +89,7 @@ fn a_users_types_come_first_and_what_is_wrong_is_said_with_its_place() {
     }
     assert!(problems.iter().any(|problem| problem.ends_with("its types contain each other")), "{problems:?}");
     assert!(library.named("own.Round").is_none() && library.named("own.Huge").is_none());
-    let own = Source { path: "own/7509.Mine.2.0.dsdl".into(), text: "uint8 a\n@sealed\n".into() };
+    let own = DsdlSource { path: "own/7509.Mine.2.0.dsdl".into(), text: "uint8 a\n@sealed\n".into() };
     let (mut types, problems) = DataTypes::with(&[own]);
     assert_eq!(problems, [""; 0]);
     let first = types.of(Generation::Cyphal).messages(7509).next().unwrap();
@@ -102,7 +104,7 @@ fn a_users_types_come_first_and_what_is_wrong_is_said_with_its_place() {
 #[test]
 fn condensed_definitions_say_the_same() {
     let text = "# What it is.\nuint8 X = 2 ** 3  # [V] eight\n\nuint8[<=X]   data   # [Volt] of something\n@assert _offset_ % 8 == {0}\n---\n@sealed\n";
-    let source = Source { path: "own/5.A.1.0.dsdl".into(), text: text.into() };
+    let source = DsdlSource { path: "own/5.A.1.0.dsdl".into(), text: text.into() };
     let short = condensed(&[source]);
     assert_eq!(short, "=== own/5.A.1.0.dsdl\nuint8 X = 2 ** 3\nuint8[<=X] data # V\n---\n@sealed\n");
     let again: Vec<_> = condensed::split(&short).collect();
@@ -125,8 +127,8 @@ fn anything_is_taken() {
         let text: String = (0..random.usize(0..30)).map(|_| words[random.usize(0..words.len())]).collect();
         let extension = ["uavcan", "1.0.dsdl"][random.usize(0..2)];
         let own = [
-            Source { path: format!("own/{}.A.{extension}", random.u16(..)), text: text.clone() },
-            Source { path: "own/B.1.0.dsdl".into(), text },
+            DsdlSource { path: format!("own/{}.A.{extension}", random.u16(..)), text: text.clone() },
+            DsdlSource { path: "own/B.1.0.dsdl".into(), text },
         ];
         let _ =
             of(own[0].generation().unwrap(), &[(&own[0].path, &own[0].text), (&own[1].path, &own[1].text)]);

@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use super::condensed;
 use super::library::Library;
 use super::model::Generation;
-use super::parse::Source;
+use super::parse::DsdlSource;
 
 /// Data types by which messages of DroneCAN and Cyphal are read.
 #[derive(Debug)]
@@ -36,7 +36,7 @@ impl DataTypes {
 
     /// Those that are built in and these, which come first where they have the same name or number. What is not understood is returned in
     /// words, with its place; a type that contains it is left out.
-    pub fn with(own: &[Source]) -> (Self, Vec<String>) {
+    pub fn with(own: &[DsdlSource]) -> (Self, Vec<String>) {
         let mut problems = Vec::new();
         let mut library = |generation, built_in| {
             let of_own = own.iter().filter(|source| source.generation() == Some(generation)).cloned();

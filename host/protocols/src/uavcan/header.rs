@@ -18,7 +18,7 @@ pub enum Purpose {
 
 /// An identifier's parts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Header {
+pub(crate) struct Header {
     /// 0 is the highest: up to 31 in DroneCAN, 7 in Cyphal.
     pub priority: u8,
     pub purpose: Purpose,

@@ -15,7 +15,7 @@ const GAP_NS: i64 = 2_000_000_000;
 
 /// A transfer that has ended.
 #[derive(Clone, Debug)]
-pub struct Transfer {
+pub(crate) struct Transfer {
     pub channel: u8,
     pub header: Header,
     /// Of its first and its last frame.
@@ -49,7 +49,7 @@ struct Last {
 
 /// A frame of a transfer.
 #[derive(Clone, Copy, Debug)]
-pub struct Part<'a> {
+pub(crate) struct Part<'a> {
     pub channel: u8,
     pub time_ns: i64,
     pub id: u32,
@@ -61,7 +61,7 @@ pub struct Part<'a> {
 
 /// Puts frames together.
 #[derive(Debug)]
-pub struct Transfers {
+pub(crate) struct Transfers {
     generation: Generation,
     sessions: FxHashMap<(u8, u32), Session>,
 }

@@ -230,7 +230,11 @@ fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Ve
             (Some(ours), serde_json::Value::String(text)) => match &ours.value {
                 Value::Text(ours) => ours == text,
                 Value::Bytes(bytes) => hex(bytes).eq_ignore_ascii_case(text),
-                _ => ours.text.as_deref().is_some_and(|ours| ours == text || text.contains(ours)),
+                // Of a set of bits in which none is set, there is no name.
+                _ => match ours.text.as_deref() {
+                    Some(ours) => text.contains(ours),
+                    None => text.is_empty(),
+                },
             },
             _ => true,
         };

@@ -92,11 +92,10 @@ impl TracePipe {
             return self.oddities.count("records of a third or higher channel");
         };
         let at = match u64::try_from(record.time_ns) {
-            // What candump shows without -t has no times.
-            Ok(0) => At::arrival(arrival),
             // A trace that arrives faster than it was recorded is no fault of anybody.
-            Ok(time_ns) => self.clock.place(time_ns, arrival, &mut Oddities::default()),
-            Err(_) => At::arrival(arrival),
+            Ok(time_ns @ 1..) => self.clock.place(time_ns, arrival, &mut Oddities::default()),
+            // What candump shows without -t has no times.
+            Ok(0) | Err(_) => At::arrival(arrival),
         };
         match Incoming::of(&record.event, channel, at) {
             Some(incoming) => reports.push(incoming),

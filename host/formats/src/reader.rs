@@ -105,7 +105,7 @@ enum Beyond {
 pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
     let path = path.as_ref();
     if path.is_dir() {
-        return files::open_folder(path, options);
+        return TraceReader::of_folder(path, options);
     }
     open_file(path, options)
 }

@@ -87,14 +87,13 @@ fn open(input: &mut Input) -> io::Result<Option<Opened>> {
     let head = file.read_at(0, len.min(HEAD_BYTES) as usize)?;
     let is_cut = head_says(&head).is_none_or(|said| said > len);
     let has_journal = head.get(VERSIONS).is_some_and(|versions| versions.contains(&2));
-    let database = match in_place.filter(|_| len > IN_MEMORY_BYTES) {
-        Some(file) => open_in_place(&file)?,
-        None => {
-            let mut bytes = file.read_at(0, len as usize)?;
-            // In memory there is no journal beside it, and SQLite would not open it.
-            bytes.get_mut(VERSIONS).unwrap_or_default().iter_mut().for_each(|version| *version = 1);
-            in_memory(bytes).map_err(io::Error::other)?
-        }
+    let database = if let Some(file) = in_place.filter(|_| len > IN_MEMORY_BYTES) {
+        open_in_place(&file)?
+    } else {
+        let mut bytes = file.read_at(0, len as usize)?;
+        // In memory there is no journal beside it, and SQLite would not open it.
+        bytes.get_mut(VERSIONS).unwrap_or_default().iter_mut().for_each(|version| *version = 1);
+        in_memory(bytes).map_err(io::Error::other)?
     };
     // Nothing that a stranger put into the file is executed.
     let safe = database.execute_batch("PRAGMA trusted_schema = OFF; PRAGMA cell_size_check = ON");

@@ -8,18 +8,18 @@ use crate::issue::{Fault, Place};
 use crate::read_options::ReadOptions;
 use crate::ros::folder;
 
-/// Opens the files of a bag in a folder.
-pub(super) fn open_folder(path: &Path, options: &ReadOptions) -> Result<TraceReader, OpenError> {
-    let files = folder::files(path).map_err(|error| OpenError::Io(path.display().to_string(), error))?;
-    let mut reader = open_file(&files.first, options)?;
-    reader.others = files.others;
-    if !files.has_metadata {
-        reader.notes.note(folder::NO_METADATA);
-    }
-    Ok(reader)
-}
-
 impl TraceReader {
+    /// Opens the files of a bag in a folder.
+    pub(super) fn of_folder(path: &Path, options: &ReadOptions) -> Result<Self, OpenError> {
+        let files = folder::files(path).map_err(|error| OpenError::Io(path.display().to_string(), error))?;
+        let mut reader = open_file(&files.first, options)?;
+        reader.others = files.others;
+        if !files.has_metadata {
+            reader.notes.note(folder::NO_METADATA);
+        }
+        Ok(reader)
+    }
+
     /// Goes on with the next file of the recording. One that cannot be opened is an issue, and does not keep from those behind it.
     pub(super) fn begin_next_file(&mut self, path: &Path) -> Beyond {
         self.name = path.display().to_string().into();

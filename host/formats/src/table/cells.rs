@@ -113,8 +113,9 @@ fn push_python_bytes(shown: &[u8], bytes: &mut Vec<u8>) -> Option<()> {
 
 /// The bytes of a cell: digits without gaps, bytes with something between them, or what Python prints.
 pub(super) fn push_bytes(cell: &[u8], decimal: bool, bytes: &mut Vec<u8>) -> Result<(), Fault> {
-    if let Some(shown) = python_bytes(cell) {
-        return push_python_bytes(shown, bytes).ok_or_else(|| Fault::malformed("data bytes", cell));
+    if [&b"b'"[..], b"b\"", b"bytearray"].iter().any(|start| cell.starts_with(start)) {
+        let read = python_bytes(cell).and_then(|shown| push_python_bytes(shown, bytes));
+        return read.ok_or_else(|| Fault::malformed("data bytes", cell));
     }
     let is_between = |byte: &u8| {
         matches!(

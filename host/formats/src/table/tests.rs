@@ -334,7 +334,7 @@ fn whole_numbers_of_no_unit_are_in_the_one_that_fits_how_often_identifiers_come(
 #[test]
 fn bytes_are_read_as_python_and_pandas_print_them() {
     for cell in [
-        r#"b'\x01 ,\\'"#,
+        r"b'\x01 ,\\'",
         r#""b'\x01 ,\\'""#,
         r#""bytearray(b'\x01 ,\\')""#,
         r#""['0x1', '0x20', '0x2c', '0x5c']""#,

@@ -108,7 +108,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         What::Dm1 { to } => StationJob::Request { pgn: DM1, to: *to },
         What::Send(send) => {
             let message = send.message()?;
-            if send.dry_run {
+            if send.preview {
                 return message.print(args.address, args.speak.json).map(|()| ExitCode::SUCCESS);
             }
             message.job()

@@ -66,7 +66,7 @@ pub struct Args {
     patience: Duration,
     /// First unlock this resource of the ECU. Requires --key-command. Can be repeated.
     #[arg(long, value_enum, value_name = "RESOURCE", requires = "key_command", global = true)]
-    security: Vec<Resource>,
+    unlock: Vec<Resource>,
     /// A command that computes the key: it gets the seed in hexadecimal on standard input, and in place of {seed}, and prints the key
     /// in hexadecimal.
     #[arg(long, value_name = "COMMAND", global = true)]
@@ -183,8 +183,8 @@ impl Args {
         if !is_ccp && (self.station.is_some() || self.order.is_some()) {
             return Err(usage("--station and --order are for --protocol ccp"));
         }
-        if is_ccp && !self.security.is_empty() {
-            return Err(usage("keys are sent by XCP only; leave --security out"));
+        if is_ccp && !self.unlock.is_empty() {
+            return Err(usage("keys are sent by XCP only; leave --unlock out"));
         }
         let described = description.and_then(|one| if is_ccp { one.ccp() } else { one.xcp() });
         let Some(parties) = self.pair.or(described) else {
@@ -233,6 +233,11 @@ impl Args {
         match &self.what {
             What::Write { yes: false, .. } => {
                 Err(usage("writing changes how the ECU works; if that is meant, add --yes"))
+            }
+            What::Poll(PollArgs { csv: true, .. }) | What::Daq(DaqArgs { csv: true, .. })
+                if self.speak.json =>
+            {
+                Err(usage("--json and --csv are two ways to print; choose one"))
             }
             What::Daq(_) if self.protocol == Spoken::Ccp => {
                 Err(usage("lists are started by XCP only; use poll for CCP"))
@@ -284,7 +289,7 @@ impl Args {
 
     fn unlock(&self, master: &mut Master<'_>) -> anyhow::Result<()> {
         let Some(command) = &self.key_command else { return Ok(()) };
-        for resource in &self.security {
+        for resource in &self.unlock {
             let seed = master.seed(resource.mask())?;
             // It is not protected.
             if seed.is_empty() {

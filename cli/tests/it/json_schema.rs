@@ -143,7 +143,7 @@ pub const LINES: &[(&str, i32, &[&str])] = &[
     ("canopen heartbeat -d virtual:load=0 -b 500k 5 --period 10ms -n 3", 0, &["conversations"]),
     ("j1939 claim -d virtual:load=0 -b 250k", 0, &["conversations"]),
     ("j1939 send -d virtual:load=0 -b 250k 0xFEEC 0102", 0, &["conversations"]),
-    ("j1939 send 130306 Reference=Apparent --dry-run", 0, &["j1939_frame"]),
+    ("j1939 send 130306 Reference=Apparent --preview", 0, &["j1939_frame"]),
     ("stats talk.log --protocols", 0, &["stats"]),
     ("decode talk.log --protocols", 0, &["decode", "decode_end"]),
     ("decode talk.log --protocols --details", 0, &["decode", "decode_end"]),

@@ -70,12 +70,12 @@ fn values_by_name_leave_as_single_frames_and_fast_packets_and_are_heard_as_such(
 }
 
 #[test]
-fn a_dry_run_prints_the_frames_and_what_is_wrong_is_refused() {
+fn a_preview_prints_the_frames_and_what_is_wrong_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let send = |more: &[&str]| cantap(folder.path(), &[&["j1939", "--address", "35", "send"], more].concat());
-    let (code, out, err) = send(&[&WIND[..], &["--dry-run"]].concat());
+    let (code, out, err) = send(&[&WIND[..], &["--preview"]].concat());
     assert_eq!((code, out.as_str()), (Some(0), "09FD0223#FF58028813FAFFFF\n"), "{err}");
-    let (_, out, _) = send(&[&MODEL[..], &["--dry-run"]].concat());
+    let (_, out, _) = send(&[&MODEL[..], &["--preview"]].concat());
     assert_eq!(out.lines().next(), Some("19F01423#0086FFFF2A006361"), "{out}");
     assert_eq!(out.lines().count(), 20, "{out}");
     for (line, expected) in [
@@ -91,7 +91,7 @@ fn a_dry_run_prints_the_frames_and_what_is_wrong_is_refused() {
             &["0xEF00", &"01".repeat(224), "--transport", "fast-packet"],
             "at most 223 bytes, and this one has 224",
         ),
-        (&["0xEF00", "010203040506070809", "--dry-run"], "depends on its receiver"),
+        (&["0xEF00", "010203040506070809", "--preview"], "depends on its receiver"),
         (&["130306", "Reference=2", "--period", "1ms"], "a period is at least 10 ms"),
         (&["130306", "Reference=2", "-n", "3"], "--period"),
     ] {

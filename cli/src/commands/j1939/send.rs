@@ -52,7 +52,7 @@ pub(super) struct SendArgs {
     pub(super) time: Option<Duration>,
     /// Print the frames that would be sent from --address, and send nothing.
     #[arg(long)]
-    pub(super) dry_run: bool,
+    pub(super) preview: bool,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -168,7 +168,7 @@ impl Message {
             cantap::Frame::data_frame(header.id(), &self.data).into_iter().collect()
         } else {
             return Err(usage(
-                "what J1939's transport sends depends on its receiver; --dry-run is for fast packets and single frames",
+                "what J1939's transport sends depends on its receiver; --preview is for fast packets and single frames",
             ));
         };
         let mut out = std::io::stdout().lock();

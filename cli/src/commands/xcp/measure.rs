@@ -31,8 +31,8 @@ pub struct PollArgs {
     #[arg(long = "for", value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Print comma-separated values.
-    #[arg(long, conflicts_with = "json")]
-    csv: bool,
+    #[arg(long)]
+    pub csv: bool,
 }
 
 /// A list that the ECU sends.
@@ -51,8 +51,8 @@ pub struct DaqArgs {
     #[arg(long = "for", value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Print comma-separated values.
-    #[arg(long, conflicts_with = "json")]
-    csv: bool,
+    #[arg(long)]
+    pub csv: bool,
 }
 
 fn columns(targets: &[Target]) -> Vec<String> {

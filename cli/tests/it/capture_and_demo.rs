@@ -256,7 +256,11 @@ fn what_cannot_work_is_one_line_with_the_next_step() {
             1,
             "cannot write to '/nowhere/x.log'; choose a folder",
         ),
-        ("info -d virtual:speed=9", 2, "there is no option 'speed'; there are car, canopen, ecu, load, frames"),
+        (
+            "info -d virtual:speed=9",
+            2,
+            "there is no option 'speed'; there are car, canopen, ecu, load, frames",
+        ),
         ("info -d virtual:load=101", 2, "'101' does not fit the option 'load': give per cent, 0 to 100"),
         ("info -d virtual:log=/nowhere.log", 2, "'/nowhere.log' does not fit the option 'log'"),
         ("info -d emu:any.elf,load=101", 2, "'101' does not fit the option 'load': give per cent, 0 to 100"),

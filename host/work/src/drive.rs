@@ -205,7 +205,8 @@ impl<'s, 'd> Drive<'s, 'd> {
             _ => None,
         };
         if let Some(advice) = advice {
-            text += &format!("; {advice}");
+            text.push_str("; ");
+            text.push_str(&advice);
         }
         if self.client.hears_pdos() && matches!(error, DriveError::Jumped { .. } | DriveError::Left { .. }) {
             text += "; another node sends it PDOs, and may command it, too";

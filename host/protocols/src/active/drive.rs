@@ -152,7 +152,8 @@ impl DriveClient {
     fn access(&mut self, access: Access) {
         let job = access.data.clone().map_or(SdoJob::Read, SdoJob::Write);
         let (ids, answer_ns) = (SdoIds::of(self.node), self.timing.answer_ns);
-        self.sdo = Some((access.clone(), SdoClient::new(ids, access.index, 0, job, false, answer_ns)));
+        let client = SdoClient::new(ids, access.index, 0, job, false, answer_ns);
+        self.sdo = Some((access, client));
     }
 
     /// What an access has brought.

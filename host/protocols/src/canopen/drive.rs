@@ -179,6 +179,7 @@ pub struct DriveView {
 
 impl DriveView {
     /// By the device type in a node's sheet, if nothing was heard.
+    #[must_use]
     pub fn or_sheet(self, sheet: Option<&Eds>, node: u8) -> Self {
         let device_type = || sheet?.value_of(0x1000, 0, node);
         let is_drive = self.is_drive.or_else(|| device_type().map(|number| number & 0xFFFF == PROFILE));

@@ -146,15 +146,13 @@ fn pick<'n>(names: impl Iterator<Item = (u64, &'n str)> + Clone, text: &str) -> 
     }
     let wanted = plain(text);
     let mut alike = names.clone().filter(|(_, name)| !wanted.is_empty() && plain(name) == wanted);
-    match (alike.next(), alike.next()) {
-        (Some((raw, _)), None) => Ok(raw),
-        _ => {
-            let mut all: Vec<_> = names.collect();
-            all.sort_unstable();
-            let all: Vec<_> = all.iter().take(20).map(|(_, name)| *name).collect();
-            Err(format!("it is a number, or one of: {}", all.join(", ")))
-        }
+    if let (Some((raw, _)), None) = (alike.next(), alike.next()) {
+        return Ok(raw);
     }
+    let mut all: Vec<_> = names.collect();
+    all.sort_unstable();
+    let all: Vec<_> = all.iter().take(20).map(|(_, name)| *name).collect();
+    Err(format!("it is a number, or one of: {}", all.join(", ")))
 }
 
 fn named(table: Option<&'static FxHashMap<u64, String>>, text: &str) -> Result<u64, String> {
@@ -193,7 +191,10 @@ fn of_physical(kind: &'static FieldKind, text: &str) -> Result<u64, String> {
         },
         Kind::Time if text.contains(':') => in_steps(time_of_day(text).ok_or("a time of day is 12:34:56.5")?),
         // Every digit of a long one counts.
-        _ if resolution == 1.0 && kind.offset == 0.0 && text.trim().parse::<i128>().is_ok() => {
+        _ if kind.resolution.is_none_or(|resolution| resolution.to_bits() == 1_f64.to_bits())
+            && kind.offset == 0.0
+            && text.trim().parse::<i128>().is_ok() =>
+        {
             text.trim().parse().map_err(|_| "it is a whole number")?
         }
         _ => match whole(text.trim()).filter(|_| text.trim().starts_with("0x")) {

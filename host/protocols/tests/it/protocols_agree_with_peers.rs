@@ -7,6 +7,7 @@
 
 use cantap_testing::peers;
 
+use std::fmt::Write as _;
 use std::io::{Read, Write as _};
 use std::process::Command;
 
@@ -430,7 +431,7 @@ fn canboat_reads_what_we_send_by_name() {
         };
         for frame in frames {
             let time_ns = 1_000_000 * records.len() as i64;
-            log += &format!("({:.6}) can0 {frame}\n", time_ns as f64 / 1e9);
+            writeln!(log, "({:.6}) can0 {frame}", time_ns as f64 / 1e9).unwrap();
             records.push(record(time_ns, &frame.to_string()));
         }
     }

@@ -345,12 +345,13 @@ impl Plan {
             (State::QuickStopActive, _) | (State::ReadyToSwitchOn, false) => {
                 self.transit(DISABLE_VOLTAGE, state, State::SwitchOnDisabled, confirm_ns)
             }
-            (State::SwitchOnDisabled, _) => self.transit(SHUTDOWN, state, State::ReadyToSwitchOn, confirm_ns),
+            (State::SwitchOnDisabled, _) | (State::SwitchedOn, false) => {
+                self.transit(SHUTDOWN, state, State::ReadyToSwitchOn, confirm_ns)
+            }
             (State::ReadyToSwitchOn, true) => self.transit(SWITCH_ON, state, State::SwitchedOn, confirm_ns),
             (State::SwitchedOn, true) => {
                 self.transit(ENABLE_OPERATION, state, State::OperationEnabled, confirm_ns)
             }
-            (State::SwitchedOn, false) => self.transit(SHUTDOWN, state, State::ReadyToSwitchOn, confirm_ns),
             (State::OperationEnabled, _) => self.transit(SWITCH_ON, state, State::SwitchedOn, stop_ns),
         }
     }

@@ -178,7 +178,10 @@ fn a_list_that_was_not_heard_set_up_stays_bytes() {
     let mut records: Vec<_> = after_connect(&SET_UP[..]).iter().map(|(ms, frame)| at(*ms, frame)).collect();
     records.insert(18, lost(12.15));
     let all = events(Xcp::new(Known::default()), &records);
-    assert!(all.iter().filter(|event| event.title == "DAQ").all(|event| event.field("list").is_some()));
+    let data: Vec<_> = all.iter().filter(|event| event.title == "DAQ").map(ToString::to_string).collect();
+    // The second packet was set up after the loss, from its first entry on, and is as long as that.
+    assert!(data[0].ends_with("list \"not heard set up\""), "{}", data[0]);
+    assert!(data[1].ends_with("odt 1, 20001008 01 02 03 04"), "{}", data[1]);
     // While it runs, a lost frame does not make it another list.
     let mut records: Vec<_> = after_connect(&SET_UP[..]).iter().map(|(ms, frame)| at(*ms, frame)).collect();
     records.insert(33, lost(14.05));

@@ -261,7 +261,7 @@ fn comes_back(group: &'static database::Group, data: &[u8], by_name: bool) -> Op
         let same = back.iter().find(|(other, _)| *other == place);
         let is_same =
             same.is_some_and(|(_, other)| match (field.value.as_number(), other.value.as_number()) {
-                (Some(one), Some(other)) if one != other => {
+                (Some(one), Some(other)) if (one - other).abs() > 0.0 => {
                     (one - other).abs() <= 1e-9 * one.abs() || by_name
                 }
                 _ => {

@@ -337,13 +337,12 @@ fn a_fault_is_reset_by_an_edge_and_stays_if_its_cause_does() {
     assert_eq!(steps(&mut drive, &[DriveStep::ResetFault]).1, Ok(()));
     assert_eq!((&drive.log[..], drive.state), (&[0x00, 0x80, 0x00][..], State::SwitchOnDisabled));
     // The bit is set already, so that there is no edge, as in a drive that does not let go.
-    struct Stuck(Drive);
-    let mut stuck = Stuck(Drive { fault: 0x7305, ..Drive::in_state(State::Fault) });
+    let mut stuck = Drive { fault: 0x7305, ..Drive::in_state(State::Fault) };
     let mut client = DriveClient::new(5, DriveTiming::default());
     client.begin(DriveStep::ResetFault);
     let mut peer = |id: Id, data: &[u8], say: &mut Say| {
-        stuck.0.word = 0x80;
-        stuck.0.hear(id, data, say);
+        stuck.word = 0x80;
+        stuck.hear(id, data, say);
     };
     run(&mut client, &mut peer, arrives);
     assert_eq!(client.outcome(), Err(DriveError::Fault { code: Some(0x7305) }));

@@ -35,8 +35,8 @@ const TOOL: u64 = 1 << 63 | 29 << 40 | 0x7FF << 21;
                 cantap j1939 -d COM5 -b 250k request 65260 --to 0\n  \
                 cantap j1939 -d COM5 -b 250k dm1\n  \
                 cantap j1939 -d COM5 -b 250k send 0xEF00 0102030405060708090A --to 3\n  \
-                cantap j1939 -d COM5 -b 250k send 'Wind Data' 'Wind Speed=6 m/s' Reference=Apparent\n  \
-                cantap j1939 -d COM5 -b 250k send 129025 Latitude=54.3 Longitude=10.1 --period 100ms\n\n\
+                cantap j1939 -d can0 -b 250k send 'Wind Data' 'Wind Speed=6 m/s' Reference=2\n  \
+                cantap j1939 -d can0 -b 250k send 'Water Depth' Depth=4.2 --period 1s\n\n\
                 It claims an address first, which takes a quarter of a second, and another one where a node with a \
                 lower NAME has it. It takes part in the bus: it acknowledges, and sends what it is asked for here and \
                 what its address demands.")]

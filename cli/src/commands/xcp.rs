@@ -33,7 +33,7 @@ use crate::{args, key_command, stderr};
                 cantap xcp -d COM5 -b 500k --pair 7F0:7F1 read 20000000:16\n  \
                 cantap xcp -d COM5 -b 500k --a2l engine.a2l write IdleSpeed 850 --yes\n  \
                 cantap xcp -d COM5 -b 500k --a2l engine.a2l poll EngineSpeed --every 100ms\n  \
-                cantap xcp -d COM5 -b 500k --a2l engine.a2l daq EngineSpeed Gear --event 0 --for 10s --csv\n  \
+                cantap xcp -d COM5 -b 500k --a2l engine.a2l daq EngineSpeed Gear --csv\n  \
                 cantap xcp -d COM5 -b 500k --a2l engine.a2l --protocol ccp read EngineSpeed\n\n\
                 It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. However \
                 it ends, with Ctrl-C too, the ECU's lists are stopped and it is disconnected. A refusal is exit code 1.")]

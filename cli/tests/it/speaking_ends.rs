@@ -66,6 +66,14 @@ fn catches_ctrl_c(child: &Child) -> bool {
     u64::from_str_radix(caught.trim(), 16).unwrap() & 1 << (SIGINT - 1) != 0
 }
 
+/// Whether it has opened this port.
+fn has_opened(child: &Child, port: &str) -> bool {
+    // Elsewhere nobody can ask.
+    let Ok(files) = std::fs::read_dir(format!("/proc/{}/fd", child.id())) else { return true };
+    let port = std::fs::canonicalize(port).unwrap();
+    files.flatten().any(|file| std::fs::read_link(file.path()).is_ok_and(|open| open == port))
+}
+
 /// Its exit code, and what it said on standard error.
 fn end(mut child: Child, line: &str) -> (Option<i32>, String) {
     let until = Instant::now() + SOON;
@@ -101,6 +109,9 @@ fn a_device_that_is_unplugged_ends_each_with_the_reason() {
             (line, start(port.name(), line), port)
         })
         .collect();
+    for (line, child, port) in &running {
+        wait_until(&format!("{line}: it has not opened its port"), || has_opened(child, port.name()));
+    }
     begin();
     for (.., port) in &mut running {
         port.unplug();

@@ -1,5 +1,7 @@
 //! What is in the ECU's memory: measured values and parameters.
 
+use half::f16;
+
 use super::conversion::{Conversion, Meaning, Texts};
 use crate::calibration::parts::ByteOrder;
 use crate::{Field, Value};
@@ -105,7 +107,7 @@ impl MemoryObject {
         let wide = 64 - 8 * self.data_type.size() as u32;
         if let DataType::Float(size) = self.data_type {
             return Number::Real(match size {
-                2 => half(raw as u16),
+                2 => f16::from_bits(raw as u16).to_f64(),
                 4 => f32::from_bits(raw as u32).into(),
                 _ => f64::from_bits(raw),
             });
@@ -254,18 +256,6 @@ impl Number {
             }
         }
     }
-}
-
-/// A number of 16 bits by IEEE 754.
-fn half(bits: u16) -> f64 {
-    let (exponent, fraction) = (bits >> 10 & 0x1F, f64::from(bits & 0x3FF));
-    let magnitude = match exponent {
-        0 => fraction * 2_f64.powi(-24),
-        0x1F if fraction == 0.0 => f64::INFINITY,
-        0x1F => f64::NAN,
-        _ => (1024.0 + fraction) * 2_f64.powi(i32::from(exponent) - 25),
-    };
-    if bits >> 15 == 1 { -magnitude } else { magnitude }
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ pub struct TooShort;
 
 /// A place in a message.
 #[derive(Clone, Copy, Debug)]
-pub struct Bits<'a> {
+pub struct BitReader<'a> {
     data: &'a [u8],
     generation: Generation,
     /// In bits.
@@ -16,7 +16,7 @@ pub struct Bits<'a> {
     end: usize,
 }
 
-impl<'a> Bits<'a> {
+impl<'a> BitReader<'a> {
     /// From the beginning.
     pub const fn of(data: &'a [u8], generation: Generation) -> Self {
         Self { data, generation, at: 0, end: data.len() * 8 }
@@ -88,53 +88,17 @@ impl<'a> Bits<'a> {
     }
 }
 
-/// A float of 16 bits (IEEE 754 binary16), which one of 32 can hold.
-pub fn half(bits: u16) -> f32 {
-    let (sign, exponent, fraction) =
-        (u32::from(bits >> 15) << 31, bits >> 10 & 0x1F, u32::from(bits & 0x3FF));
-    match exponent {
-        0 => {
-            // Exact: ten bits and a power of two.
-            let value = fraction as f32 / 16_777_216.0;
-            if sign == 0 { value } else { -value }
-        }
-        0x1F => f32::from_bits(sign | 0x7F80_0000 | fraction << 13),
-        _ => f32::from_bits(sign | (u32::from(exponent) + 112) << 23 | fraction << 13),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Values of the standard's table of examples.
-    #[test]
-    fn halves_are_read_exactly() {
-        for (bits, value) in [
-            (0x0000, 0.0),
-            (0x0001, 5.960_464_5e-8),
-            (0x03FF, 6.097_555e-5),
-            (0x0400, 6.103_515_6e-5),
-            (0x3555, 0.333_251_95),
-            (0x3BFF, 0.999_511_7),
-            (0x3C00, 1.0),
-            (0x7BFF, 65_504.0),
-            (0x7C00, f32::INFINITY),
-            (0xC000, -2.0),
-            (0x8001, -5.960_464_5e-8),
-        ] {
-            assert_eq!(half(bits).to_bits(), f32::to_bits(value), "{bits:04X}");
-        }
-        assert!(half(0x7E00).is_nan());
-    }
-
     #[test]
     fn numbers_are_read_in_the_order_of_their_language() {
         // Twelve bits 0xABC behind four: DroneCAN sends BC, then the A.
-        let mut bits = Bits::of(&[0x5B, 0xCA], Generation::DroneCan);
+        let mut bits = BitReader::of(&[0x5B, 0xCA], Generation::DroneCan);
         assert_eq!((bits.take(4), bits.take(12)), (Ok(5), Ok(0xABC)));
         assert_eq!(bits.take(1), Err(TooShort));
-        let mut bits = Bits::of(&[0xC5, 0xAB], Generation::Cyphal);
+        let mut bits = BitReader::of(&[0xC5, 0xAB], Generation::Cyphal);
         assert_eq!((bits.take(4), bits.take(12), bits.take(9)), (Ok(5), Ok(0xABC), Ok(0)));
     }
 }

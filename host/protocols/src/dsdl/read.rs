@@ -3,8 +3,9 @@
 use std::borrow::Cow;
 
 use cantap_signals::shortest_of_f32;
+use half::f16;
 
-use super::bits::{Bits, TooShort, half};
+use super::bits::{BitReader, TooShort};
 use super::library::Library;
 use super::meaning;
 use super::model::{Generation, Kind, Member, Section, Size, bits_for};
@@ -49,7 +50,7 @@ pub(crate) fn read<'a>(
     prefix: &str,
     fields: &mut Vec<Field>,
 ) -> Result<&'a [u8], Unread> {
-    let mut bits = Bits::of(data, library.generation);
+    let mut bits = BitReader::of(data, library.generation);
     let mut reader = Reader { library, prefix, fields, elements: 0 };
     reader.section(section, &mut bits, is_open, &mut String::new(), 0)?;
     Ok(bits.rest())
@@ -59,7 +60,7 @@ impl Reader<'_> {
     fn section(
         &mut self,
         section: &Section,
-        bits: &mut Bits<'_>,
+        bits: &mut BitReader<'_>,
         is_open: bool,
         path: &mut String,
         depth: u8,
@@ -92,7 +93,7 @@ impl Reader<'_> {
     fn member(
         &mut self,
         member: &Member,
-        bits: &mut Bits<'_>,
+        bits: &mut BitReader<'_>,
         is_open: bool,
         path: &mut String,
         depth: u8,
@@ -111,7 +112,7 @@ impl Reader<'_> {
         &mut self,
         member: &Member,
         kind: &Kind,
-        bits: &mut Bits<'_>,
+        bits: &mut BitReader<'_>,
         is_open: bool,
         path: &mut String,
         depth: u8,
@@ -142,7 +143,7 @@ impl Reader<'_> {
             Kind::Float(count) => {
                 let value = bits.take(*count)?;
                 let value = match count {
-                    16 => shortest_of_f32(half(value as u16)),
+                    16 => shortest_of_f32(f16::from_bits(value as u16).to_f32()),
                     32 => shortest_of_f32(f32::from_bits(value as u32)),
                     _ => f64::from_bits(value),
                 };
@@ -185,7 +186,7 @@ impl Reader<'_> {
         member: &Member,
         element: &Kind,
         size: Size,
-        bits: &mut Bits<'_>,
+        bits: &mut BitReader<'_>,
         is_open: bool,
         path: &mut String,
         depth: u8,
@@ -232,7 +233,7 @@ impl Reader<'_> {
     }
 
     /// The number of elements.
-    fn count(&self, size: Size, bits: &mut Bits<'_>) -> Result<u32, Unread> {
+    fn count(&self, size: Size, bits: &mut BitReader<'_>) -> Result<u32, Unread> {
         match size {
             Size::Fixed(count) => Ok(count),
             Size::UpTo(most) => {
@@ -243,7 +244,7 @@ impl Reader<'_> {
         }
     }
 
-    fn bytes(&mut self, size: Size, bits: &mut Bits<'_>, is_open: bool) -> Result<Bytes, Unread> {
+    fn bytes(&mut self, size: Size, bits: &mut BitReader<'_>, is_open: bool) -> Result<Bytes, Unread> {
         let without_count = is_open && matches!(size, Size::UpTo(_));
         let count = if without_count { (bits.left() / 8) as u32 } else { self.count(size, bits)? };
         if count > size.most() {

@@ -10,7 +10,7 @@ use crate::j1939::MOST_FAST_BYTES;
 
 /// A group with its bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct GroupMessage {
+pub struct EncodedGroup {
     /// The group's number.
     pub pgn: u32,
     /// Its name.
@@ -27,10 +27,10 @@ pub struct GroupMessage {
 ///
 /// # Errors
 /// See [`EncodeError`].
-pub fn encode(group: &str, values: &[(&str, &str)]) -> Result<GroupMessage, EncodeError> {
+pub fn encode(group: &str, values: &[(&str, &str)]) -> Result<EncodedGroup, EncodeError> {
     let chosen = choose(group, values)?;
     let data = encode_as(chosen, values)?;
-    Ok(GroupMessage { pgn: chosen.pgn, name: &chosen.description, priority: chosen.priority, data })
+    Ok(EncodedGroup { pgn: chosen.pgn, name: &chosen.description, priority: chosen.priority, data })
 }
 
 /// The bytes of this group.

@@ -11,7 +11,7 @@ mod fields;
 mod tests;
 mod values;
 
-pub use encode::{GroupMessage, encode};
+pub use encode::{EncodedGroup, encode};
 pub use encode_error::EncodeError;
 
 use std::borrow::Cow;

@@ -281,7 +281,7 @@ fn values_by_name_become_the_bytes_of_their_group() {
         encode("position, rapid update", &[("latitude", "37.9220534"), ("Longitude", "23.016909 deg")]);
     assert_eq!(
         made,
-        Ok(GroupMessage {
+        Ok(EncodedGroup {
             pgn: 129_025,
             name: "Position, Rapid Update",
             priority: Some(2),

@@ -185,7 +185,7 @@ fn the_polite_end_leaves_a_whole_file_and_a_silent_board() {
     let mut bytes = Vec::new();
     until("some packets", || {
         keep(&received, &mut bytes);
-        bytes.len() > 20_000
+        bytes.len() > 30_000
     });
     let (code, out, err) = end(child, Signal::TERM);
     assert_eq!((code, &*out, &*err), (Some(0), "", ""));

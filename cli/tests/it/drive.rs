@@ -226,8 +226,7 @@ fn a_fault_in_a_motion_is_named_and_can_be_reset() {
         ["canopen", "-d", &rig.served.at, "-b", "500k", "write", "5", "2000", "0", "0x8611", "--type", "u16"];
     let _ = Command::new(CANTAP).args(line).output().unwrap();
     let (code, _, err) = ended(running);
-    let is_named =
-        err.contains("following error (8611)") || err.contains("SDO channel at the same time");
+    let is_named = err.contains("following error (8611)") || err.contains("SDO channel at the same time");
     assert!(code == Some(1) && is_named && err.ends_with("it was stopped, and is fault\n"), "{err}");
     let (code, _, err) = rig.run("5 enable --yes");
     assert!(code == Some(1) && err.contains("it has a fault: following error (8611)"), "{err}");

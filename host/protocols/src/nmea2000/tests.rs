@@ -332,7 +332,7 @@ fn values_by_name_become_the_bytes_of_their_group() {
     assert_eq!(said[3..], ["Key 4095", "Length 2 bytes", "Value 01 02"]);
     let text = |group: &str, values: &[(&str, &str)]| encode(group, values).unwrap_err().to_string();
     for (group, values, expected) in [
-        ("positon", &[][..], "CANboat's database has no group 'positon'"),
+        ("whereabouts", &[][..], "CANboat's database has no group 'whereabouts'"),
         ("Rapid Update", &[], "CANboat's database has no group 'Rapid Update'; there are "),
         (
             "129025",

@@ -10,7 +10,7 @@ use crate::calibration::finding::{ConnectionFinder, Sign};
 
 /// How long the response may take, in nanoseconds.
 const RESPONSE_NS: i64 = 1_000_000_000;
-/// How many CONNECTs on different identifiers may wait for their response.
+/// How many requests to connect on different identifiers may wait for their response.
 const MOST_WAITING: usize = 16;
 
 /// Finds out who is a master and who its slave.

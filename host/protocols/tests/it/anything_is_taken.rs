@@ -181,7 +181,7 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 14] = [
             _ => (Id::standard_truncated(master + 1), vec![0xFF, 1, 2, 3, 4, 5, 6, 7]),
         }
     }),
-    // Lists that grow.
+    // Lists that grow, and now and then a command that is not answered.
     ("XCP lists", &[Protocol::Xcp], |at| {
         let number = (at / 6) as u16;
         let [low, high] = number.to_le_bytes();
@@ -191,6 +191,7 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 14] = [
             0 => (Id::standard_truncated(0x7F0), vec![0xE2, 0, low, high, number as u8, number as u8]),
             2 => (Id::standard_truncated(0x7F0), vec![0xE1, 0xFF, 4, 0, 0, 0, 0, 0x20]),
             4 => (Id::standard_truncated(0x7F0), vec![0xD4, 0, low, high, 251]),
+            5 if at % 60 == 59 => (Id::standard_truncated(0x100), Vec::new()),
             _ => (Id::standard_truncated(0x7F1), vec![0xFF]),
         }
     }),

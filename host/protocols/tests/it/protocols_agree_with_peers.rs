@@ -231,9 +231,12 @@ fn differences(our: &Event, their: &serde_json::Value, fields: &mut usize) -> Ve
             (Some(ours), serde_json::Value::String(text)) => match &ours.value {
                 Value::Text(ours) => ours == text,
                 Value::Bytes(bytes) => hex(bytes).eq_ignore_ascii_case(text),
-                // Of a set of bits in which none is set, there is no name.
-                _ => match ours.text.as_deref() {
-                    Some(ours) => text.contains(ours),
+                // Of a set of bits in which none is set, there is no name; of a time of day, no fraction.
+                number => match ours.text.as_deref() {
+                    Some(ours) => {
+                        let is_whole = field[2].as_f64() == number.as_number();
+                        text.contains(ours) || is_whole && ours.starts_with(text.as_str())
+                    }
                     None => text.is_empty(),
                 },
             },

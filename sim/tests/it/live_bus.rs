@@ -301,6 +301,7 @@ fn the_order_on_the_bus_is_the_order_of_confirmation() {
 /// RM0090 Rev 21 §32.4.1 and §32.7.6: initialisation mode changes no counter; the controller's reset and the end of bus-off do. The
 /// virtual device does the same (`host/virtual/tests/it/virtual_device.rs`).
 #[test]
+#[ignore = "runs the firmware: CANTAP_FIRMWARE_ELF and --include-ignored"]
 fn error_counters_outlive_closing_and_opening() {
     let mut rig = connected(common::setup());
     rig.ask(Command::Open { channel: Can1, config: Some(normal()) }).unwrap();

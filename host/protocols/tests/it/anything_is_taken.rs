@@ -195,8 +195,15 @@ const BEGINNINGS: [(&str, &[Protocol], Beginning); 14] = [
             _ => (Id::standard_truncated(0x7F1), vec![0xFF]),
         }
     }),
+    // Of ever more sessions, whose slaves answer the first two only.
     ("CCP commands", &[Protocol::Ccp], |at| {
-        (Id::standard_truncated(0x100 + at / 64 % 0x700), vec![1, at as u8, 0, 0, 0, 0, 0, 0])
+        let (master, place) = (0x100 + at / 64 % 0x300 * 2, (at % 64) as u8);
+        match place {
+            0 => (Id::standard_truncated(master), vec![0x01, 0, 0x39, 0, 0, 0, 0, 0]),
+            1 | 3 => (Id::standard_truncated(master + 1), vec![0xFF, 0, place / 2, 2, 1, 0, 0, 0]),
+            2 => (Id::standard_truncated(master), vec![0x1B, 1, 2, 1, 0, 0, 0, 0]),
+            _ => (Id::standard_truncated(master), vec![0x1B, place - 2, 2, 1, 0, 0, 0, 0]),
+        }
     }),
     // The first fragment and those in the middle, without a last one.
     ("DeviceNet fragments", &[Protocol::DeviceNet], |at| {

@@ -461,6 +461,10 @@ pub(crate) fn ids_are_decimal(ids: &[&[u8]]) -> (bool, bool) {
     let mut different = plain;
     different.sort_unstable();
     different.dedup();
+    // Of three digits below 800 each are hexadecimal ones without a letter as well: decimal ones would hardly all be between 100 and 799.
+    if different.iter().all(|id| id.len() == 3 && id[0] < b'8') {
+        return (false, false);
+    }
     // Those of one digit are the same in both.
     (different.len() >= ENOUGH, different.len() >= ENOUGH || different.iter().all(|id| id.len() == 1))
 }

@@ -96,7 +96,7 @@ fn refusal(is_ccp: bool, code: u8) -> String {
         xcp::error::OUT_OF_RANGE => "; the ECU has no such address, list or event",
         0x23 => "; it is not to be written",
         xcp::error::ACCESS_DENIED => "; the ECU has nothing there, or not for reading or writing",
-        xcp::error::ACCESS_LOCKED => "; unlock it with --security and --key-command",
+        xcp::error::ACCESS_LOCKED => "; unlock it with --unlock and --key-command",
         xcp::error::DAQ_CONFIG | xcp::error::MEMORY_OVERFLOW => "; measure less at once",
         _ => "",
     };

@@ -423,8 +423,13 @@ fn what_tshark_prints_is_read_with_decimal_identifiers() {
         assert_eq!(as_log(&file.replace(',', separator)), (log.to_owned(), vec![]));
     }
     // Without names, identifiers of the same number of digits without a letter are decimal if there are many.
-    let row = |n: u32| format!("1478198376.{:06}000\t{}\t1\t{n:02x}\n", n, 100 + 13 * n);
+    let row = |n: u32| format!("1478198376.{:06}000\t{}\t1\t{n:02x}\n", n, 1000 + 13 * n);
     let (log, issues) = as_log(&(0..20).map(row).collect::<String>());
     assert_eq!(issues, Vec::<String>::new());
-    assert!(log.starts_with("(1478198376.000000) can0 064#00\n(1478198376.000001) can0 071#01\n"), "{log}");
+    assert!(log.starts_with("(1478198376.000000) can0 3E8#00\n(1478198376.000001) can0 3F5#01\n"), "{log}");
+    // A bus may well have these in hexadecimal digits.
+    let row = |n: u32| format!("1478198376.{:06}\t{}\t1\t{n:02x}\n", n, 100 + 50 * (n % 14));
+    let (log, issues) = as_log(&(0..28).map(row).collect::<String>());
+    assert_eq!(issues, Vec::<String>::new());
+    assert!(log.starts_with("(1478198376.000000) can0 100#00\n(1478198376.000001) can0 150#01\n"), "{log}");
 }

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use cantap_can::LossStage;
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
-use crate::{Assembler, Event};
+use crate::{Assembler, Event, Options, Protocol, ReadItem, Reader};
 
 /// A frame on channel 1.
 pub fn at(time_ms: f64, frame: &str) -> TraceRecord {
@@ -53,4 +53,19 @@ pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Eve
 pub fn event_lines(assembler: impl Assembler, frames: &[(f64, &str)]) -> Vec<String> {
     let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
     events(assembler, &records).iter().map(ToString::to_string).collect()
+}
+
+/// The protocols of the events that a reader finds by itself in frames with times in milliseconds, in the order in which they begin.
+pub fn found(frames: &[(f64, &str)]) -> Vec<Protocol> {
+    let (mut reader, mut found) = (Reader::new(Options::default()), Vec::new());
+    let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
+    let Ok(()) = reader.take(&records, false, |read| {
+        if let ReadItem::Event(event) = read
+            && !found.contains(&event.protocol)
+        {
+            found.push(event.protocol);
+        }
+        Ok::<_, std::convert::Infallible>(())
+    });
+    found
 }

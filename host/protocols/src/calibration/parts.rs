@@ -64,6 +64,16 @@ pub struct CommandDefinition {
     pub response: &'static [PacketPart],
 }
 
+/// One line of a table of commands.
+pub(crate) const fn command(
+    code: u8,
+    name: &'static str,
+    request: &'static [PacketPart],
+    response: &'static [PacketPart],
+) -> CommandDefinition {
+    CommandDefinition { code, name, request, response }
+}
+
 /// The names of the bits of a byte that are set, each a mask.
 pub fn bit_names(byte: u8, names: &[(u8, &'static str)]) -> Option<String> {
     let set = names.iter().filter(|(mask, _)| byte & mask != 0).map(|(_, name)| *name);

@@ -3,7 +3,7 @@
 //! A station's address is sent with its lowest byte first; in which order all other numbers are, is the ECU's own matter.
 
 use crate::calibration::parts::PacketPart::{self, Bits, Hex, Named, Number, Rest, Skip};
-use crate::calibration::parts::{CommandDefinition, name_in};
+use crate::calibration::parts::{CommandDefinition, command, name_in};
 
 /// Packet identifier of the answer to a command.
 pub const COMMAND_RETURN: u8 = 0xFF;
@@ -29,15 +29,6 @@ pub mod command {
     pub const EXCHANGE_ID: u8 = 0x17;
     pub const GET_CCP_VERSION: u8 = 0x1B;
     pub const DNLOAD_6: u8 = 0x23;
-}
-
-const fn command(
-    code: u8,
-    name: &'static str,
-    request: &'static [PacketPart],
-    response: &'static [PacketPart],
-) -> CommandDefinition {
-    CommandDefinition { code, name, request, response }
 }
 
 /// Resources, as in the response to EXCHANGE_ID, seeds and keys.

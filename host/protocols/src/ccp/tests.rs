@@ -1,9 +1,9 @@
 //! Sessions of CCP, as masters and slaves have them.
 
 use super::*;
+use crate::Protocol;
 use crate::calibration::Known;
-use crate::testing::{at, event_lines};
-use crate::{Options, Protocol, Reader};
+use crate::testing::{event_lines, found};
 
 const SESSION: [(f64, &str); 22] = [
     (0.0, "700#0100000200000000"),
@@ -50,20 +50,6 @@ fn a_session_is_found_by_its_counters_and_read() {
             "ccp 700 > 701 DISCONNECT: command 0x07, counter 9, mode 0x01 (end of session), station 0x0200, after 1 ms",
         ]
     );
-}
-
-fn found(frames: &[(f64, &str)]) -> Vec<Protocol> {
-    let (mut reader, mut found) = (Reader::new(Options::default()), Vec::new());
-    let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
-    let Ok(()) = reader.take(&records, false, |read| {
-        if let crate::ReadItem::Event(event) = read
-            && !found.contains(&event.protocol)
-        {
-            found.push(event.protocol);
-        }
-        Ok::<_, std::convert::Infallible>(())
-    });
-    found
 }
 
 #[test]

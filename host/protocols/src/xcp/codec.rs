@@ -1,7 +1,7 @@
 //! The packets of XCP (ASAM MCD-1 XCP 1.5, protocol layer): identifiers, commands with their parts, errors, events, services.
 
 use crate::calibration::parts::PacketPart::{self, Bits, Hex, Named, Number, Rest, Skip};
-use crate::calibration::parts::{CommandDefinition, name_in};
+use crate::calibration::parts::{CommandDefinition, command, name_in};
 
 /// Packet identifier of a positive response.
 pub const RES: u8 = 0xFF;
@@ -75,15 +75,6 @@ pub mod error {
 pub const EV_CMD_PENDING: u8 = 0x05;
 /// Code of the event with which the slave ends the session.
 pub const EV_SESSION_TERMINATED: u8 = 0x07;
-
-const fn command(
-    code: u8,
-    name: &'static str,
-    request: &'static [PacketPart],
-    response: &'static [PacketPart],
-) -> CommandDefinition {
-    CommandDefinition { code, name, request, response }
-}
 
 /// Resources, as in CONNECT's response, protection, seeds and keys.
 pub const RESOURCES: &[(u8, &str)] =

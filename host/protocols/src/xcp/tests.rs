@@ -1,9 +1,9 @@
 //! Sessions of XCP, as masters and slaves on CAN have them.
 
 use super::*;
+use crate::Protocol;
 use crate::calibration::Known;
-use crate::testing::{at, event_lines, events, lost};
-use crate::{Options, Protocol, Reader};
+use crate::testing::{at, event_lines, events, found, lost};
 
 const CONNECT: [(f64, &str); 2] = [(0.0, "7F0#FF00"), (1.0, "7F1#FF05C00808000101")];
 
@@ -205,20 +205,6 @@ fn what_is_not_answered_is_reported() {
     );
     assert!(all[1].contains("status 0x00"), "{}", all[1]);
     assert!(all[2].ends_with("DISCONNECT: command 0xFE; nothing came for 2000 ms"), "{}", all[2]);
-}
-
-fn found(frames: &[(f64, &str)]) -> Vec<Protocol> {
-    let (mut reader, mut found) = (Reader::new(Options::default()), Vec::new());
-    let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
-    let Ok(()) = reader.take(&records, false, |read| {
-        if let crate::ReadItem::Event(event) = read
-            && !found.contains(&event.protocol)
-        {
-            found.push(event.protocol);
-        }
-        Ok::<_, std::convert::Infallible>(())
-    });
-    found
 }
 
 /// Data packets begin with small numbers, as frames of ISO 15765-2 do.

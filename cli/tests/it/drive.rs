@@ -23,7 +23,6 @@ impl Rig {
     fn new(node: &str) -> Self {
         let served = Served::start("virtual:load=0", Stdio::null());
         let folder = served.folder.path();
-        std::fs::write(folder.join("ready.rhai"), "log(\"ready\");").unwrap();
         let script = if node.starts_with("node:") {
             node.to_owned()
         } else {
@@ -34,16 +33,7 @@ impl Rig {
         listener.args(["capture", "-d", &served.at, "-b", "500k", "-t", "5m", "-o", "heard.log"]);
         let listener =
             listener.current_dir(folder).stdin(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-        let mut node = Command::new(CANTAP)
-            .args(["run", &script, "ready.rhai", "-d", &served.at, "-b", "500k"])
-            .current_dir(folder)
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(node.stdout.take().unwrap()).lines();
-        assert!(lines.any(|line| line.unwrap().ends_with("ready.rhai: ready")));
-        std::thread::spawn(move || lines.count());
+        let node = served.run_node(&script, &[]);
         Self { served, node, listener }
     }
 

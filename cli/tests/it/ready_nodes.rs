@@ -8,7 +8,6 @@
 use crate::served::Served;
 use cantap_testing::peers;
 
-use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
 
 use serde_json::{Value, json};
@@ -24,18 +23,7 @@ struct Rig {
 impl Rig {
     fn new(node: &str) -> Self {
         let served = Served::start("virtual:load=0", Stdio::inherit());
-        // Scripts begin one after the other: when this one says so, the node has begun.
-        std::fs::write(served.folder.path().join("ready.rhai"), "log(\"ready\");").unwrap();
-        let mut node = Command::new(CANTAP)
-            .args(["run", node, "ready.rhai", "-d", &served.at, "-b", "500k", "-o", "heard.log"])
-            .current_dir(served.folder.path())
-            .stdin(Stdio::null())
-            .stdout(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let mut lines = BufReader::new(node.stdout.take().unwrap()).lines();
-        assert!(lines.any(|line| line.unwrap().ends_with("ready.rhai: ready")));
-        std::thread::spawn(move || lines.count());
+        let node = served.run_node(node, &["-o", "heard.log"]);
         Self { served, node }
     }
 

@@ -37,6 +37,25 @@ impl Served {
         let (host, port) = way.strip_prefix("can://").unwrap().split_once(':').unwrap();
         Self { server, at, socketcand: [host.to_owned(), port.to_owned()], folder }
     }
+
+    /// Runs a script, or a ready node, in the folder; returns when it has begun.
+    #[cfg(unix)]
+    pub fn run_node(&self, script: &str, options: &[&str]) -> Child {
+        // Scripts begin one after the other: when this one says so, the other has begun.
+        std::fs::write(self.folder.path().join("ready.rhai"), "log(\"ready\");").unwrap();
+        let mut node = Command::new(env!("CARGO_BIN_EXE_cantap"))
+            .args(["run", script, "ready.rhai", "-d", &self.at, "-b", "500k"])
+            .args(options)
+            .current_dir(self.folder.path())
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(node.stdout.take().unwrap()).lines();
+        assert!(lines.any(|line| line.unwrap().ends_with("ready.rhai: ready")));
+        std::thread::spawn(move || lines.count());
+        node
+    }
 }
 
 impl Drop for Served {

@@ -44,9 +44,6 @@ const NAMES: [(&[&str], &str); 13] = [
     (&["version"], "cantap --version"),
 ];
 
-/// Names of databases end so.
-const DATABASES: [&str; 5] = ["dbc", "kcd", "sym", "arxml", "dbf"];
-
 /// What a wrong command line may have meant.
 pub fn advice(
     error: &clap::Error,
@@ -121,9 +118,7 @@ fn of_argument(text: &str, command: &clap::Command, arguments: &[OsString]) -> O
 }
 
 fn is_database(path: &Path) -> bool {
-    let suffix = path.extension().and_then(|suffix| suffix.to_str());
-    suffix.is_some_and(|suffix| DATABASES.iter().any(|known| suffix.eq_ignore_ascii_case(known)))
-        && path.is_file()
+    cantap_signals::is_database_name(path) && path.is_file()
 }
 
 #[cfg(test)]

@@ -13,6 +13,7 @@ pub mod canopen;
 pub mod ccp;
 mod condition;
 mod conversations;
+mod crc;
 pub mod devicenet;
 pub mod diagnostics;
 pub mod dsdl;

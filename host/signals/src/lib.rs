@@ -64,6 +64,11 @@ pub use sheet::rows_of_text;
 /// What the names of databases end with, the usual ones first.
 pub const SUFFIXES: [&str; 8] = ["dbc", "kcd", "sym", "arxml", "dbf", "toml", "xlsx", "csv"];
 
+/// Whether a file is a database if its name ends as it does: tables and TOML may be anything else as well.
+pub fn is_database_name(path: &Path) -> bool {
+    FileKind::of("", path).is_ok_and(FileKind::is_sure)
+}
+
 /// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, `.dbf`, a table of signals in `.xlsx`, `.csv` or `.tsv`, or
 /// `.toml` for cantap's own signal file. For a KCD or ARXML
 /// file with several buses, `FILE#BUS` selects one; without it, all are read as one.

@@ -22,5 +22,4 @@ pub use condensed::condensed;
 pub(crate) use model::{Definition, Generation, Section};
 pub use parse::DsdlSource;
 pub(crate) use read::{Unread, read};
-pub(crate) use signature::crc16;
 pub use types::{DataTypes, UnknownType};

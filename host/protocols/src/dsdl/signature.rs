@@ -34,18 +34,6 @@ impl Signature {
     }
 }
 
-/// CRC-16/CCITT-FALSE, from a value on; 0xFFFF at the beginning.
-pub(crate) fn crc16(from: u16, bytes: &[u8]) -> u16 {
-    bytes.iter().fold(from, |mut crc, byte| {
-        crc ^= u16::from(*byte) << 8;
-        for _ in 0..8 {
-            let carry = crc >> 15;
-            crc = (crc << 1) ^ (carry * 0x1021);
-        }
-        crc
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -56,6 +44,5 @@ mod tests {
         assert_eq!(Signature::new().with(b"123456789").value(), 0x62EC_59E3_F1A4_F00A);
         let first = Signature::new().with(b"1234");
         assert_eq!(Signature::from(first.value()).with(b"56789").value(), 0x62EC_59E3_F1A4_F00A);
-        assert_eq!(crc16(0xFFFF, b"123456789"), 0x29B1);
     }
 }

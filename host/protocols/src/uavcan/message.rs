@@ -2,7 +2,8 @@
 
 use super::header::Purpose;
 use super::transfers::Transfer;
-use crate::dsdl::{DataTypes, Definition, Generation, Section, Unread, crc16, read};
+use crate::crc::crc16;
+use crate::dsdl::{DataTypes, Definition, Generation, Section, Unread, read};
 use crate::{Bytes, Field, Trouble};
 
 /// A message has fewer bytes than its type.

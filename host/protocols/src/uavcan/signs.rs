@@ -7,7 +7,8 @@ use super::header::{Header, Purpose, Tail};
 use super::message::crc_of;
 use super::nodes::status_port;
 use crate::Protocol;
-use crate::dsdl::{DataTypes, Generation, crc16};
+use crate::crc::crc16;
+use crate::dsdl::{DataTypes, Generation};
 
 /// How many identifiers are followed; a bus of theirs has fewer.
 const MOST_IDS: usize = 2048;

@@ -18,7 +18,7 @@ fn frames(generation: Generation, id: u32, transfer: u8, payload: &[u8], signatu
             Generation::DroneCan => {
                 bytes.splice(0..0, message::crc_of(signature, payload).to_le_bytes());
             }
-            Generation::Cyphal => bytes.extend(crate::dsdl::crc16(0xFFFF, payload).to_be_bytes()),
+            Generation::Cyphal => bytes.extend(crate::crc::crc16(0xFFFF, payload).to_be_bytes()),
         }
     }
     let count = bytes.len().div_ceil(7).max(1);

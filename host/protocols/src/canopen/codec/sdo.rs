@@ -485,14 +485,7 @@ const fn begin_bytes(command: u8) -> usize {
 
 /// CRC-16 with the polynomial 1021, from 0 (CiA 301, 7.2.4.3.16).
 pub fn crc_of(bytes: &[u8]) -> u16 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(
-            crc ^ u16::from(*byte) << 8,
-            |crc, _| {
-                if crc & 0x8000 == 0 { crc << 1 } else { crc << 1 ^ 0x1021 }
-            },
-        )
-    })
+    crate::crc::crc16(0, bytes)
 }
 
 #[cfg(test)]

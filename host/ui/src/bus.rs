@@ -16,16 +16,20 @@ use cantap_work::live::{Line, Lines, return_text};
 use cantap_work::reception::Reception;
 use cantap_work::recording::{Older, Recording};
 use cantap_work::report::{Reporter, Severity};
+use cantap_work::requested_rate::RequestedRate;
 use cantap_work::{advice, channels::place_of, interrupt};
 
 use crate::device::Device;
 use crate::sender;
 use crate::shared::{Order, Shared};
 use crate::state::{ChannelState, DeviceState, RecordingState, State};
+use crate::vehicle::Vehicle;
 use crate::visits::Visits;
 
 /// How long a single wait for records lasts.
 const WAIT: Duration = Duration::from_millis(20);
+/// The same while a vehicle's answer is awaited: what it sends wants its flow control soon.
+const SHORT_WAIT: Duration = Duration::from_millis(1);
 /// How often to ask for the device's state, and to flush a recording.
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 /// After so many requests of pages, what has arrived is taken first.
@@ -43,6 +47,7 @@ pub struct Bus {
     at_first: (ChannelOptions, Vec<Filter>),
     pub(crate) recording: Option<Recording>,
     reception: Reception,
+    pub(crate) vehicle: Vehicle,
     /// The latest record's time.
     latest_ns: i64,
 }
@@ -74,6 +79,7 @@ impl Bus {
             at_first,
             recording,
             reception: Reception::default(),
+            vehicle: Vehicle::default(),
             latest_ns: 0,
         };
         // Those that are shared are opened for the first page.
@@ -118,6 +124,7 @@ impl Bus {
                 let Ok(order) = self.orders.try_recv() else { break };
                 self.obey(order);
             }
+            self.ask_vehicle();
             let Some(lines) = &self.lines else { continue };
             for (board, device) in lines.devices() {
                 // If it does not answer, the stream reports that.
@@ -183,7 +190,21 @@ impl Bus {
         let mut lines = self.device.lines(&self.reporter);
         lines.connect()?;
         self.begin(lines);
+        // What was found by listening is not looked for again when something else changes.
+        if self.device.open.timing.has_auto() {
+            self.device.open = self.at_rates(&self.shared.state().channels);
+        }
         Ok(())
+    }
+
+    /// How to open the devices with the bit rates that these channels have; the others as before.
+    pub(crate) fn at_rates(&self, channels: &[ChannelState]) -> ChannelOptions {
+        let mut open = self.device.open.clone();
+        for of in channels {
+            let rate = RequestedRate { channel: Some(of.channel), bitrate_bps: Some(of.bitrate) };
+            open.timing.set_bit_rate_of(rate);
+        }
+        open
     }
 
     /// The same for devices of which some may be away: they are opened as soon as they are there.
@@ -217,6 +238,8 @@ impl Bus {
     /// Ends the session; what was captured up to then is kept.
     fn disconnect(&mut self) {
         let Some(mut lines) = self.lines.take() else { return };
+        self.vehicle.forget("its channels were opened anew");
+        self.show_vehicle();
         // If that fails, a device has just gone.
         let _ = lines.stop();
         loop {
@@ -255,6 +278,8 @@ impl Bus {
     fn has_ended(&mut self, error: &anyhow::Error) {
         let reason = advice::sentence(error);
         self.lines = None;
+        self.vehicle.forget(&reason);
+        self.show_vehicle();
         self.warn(&reason);
         self.shared.change(|state| {
             state.ended = Some(reason);
@@ -281,7 +306,7 @@ impl Bus {
             std::thread::sleep(WAIT);
             return;
         };
-        match lines.next(WAIT) {
+        match lines.next(if self.vehicle.is_urgent() { SHORT_WAIT } else { WAIT }) {
             (_, Happening::Records(batch)) => {
                 self.take(&batch);
                 if let Some(lines) = &self.lines {
@@ -291,6 +316,10 @@ impl Bus {
             (board, Happening::Gone(error)) if self.device.may_come_back(board) => {
                 let reason = advice::sentence(&error);
                 self.warn(format!("{reason}; it continues when the device is back"));
+                if board == 0 {
+                    self.vehicle.forget(&reason);
+                    self.show_vehicle();
+                }
                 self.shared.change(|state| {
                     state.periodic.retain(|entry| place_of(entry.channel).0 != board);
                     if let Some(device) = state.devices.get_mut(board) {
@@ -322,6 +351,7 @@ impl Bus {
 
     /// Records first, then keeps it for the pages.
     fn take(&mut self, records: &[TraceRecord]) {
+        self.vehicle.take(records);
         let filters = &self.device.filters;
         let is_wanted = |record: &&TraceRecord| record.frame().is_none() || passes(filters, record);
         let passed: Vec<TraceRecord>;
@@ -387,9 +417,28 @@ impl Bus {
         });
     }
 
+    fn ask_vehicle(&mut self) {
+        let device = self.lines.as_ref().and_then(|lines| lines.devices().find(|(board, _)| *board == 0));
+        if self.vehicle.go_on(device.map(|(_, device)| device)) {
+            self.show_vehicle();
+        }
+    }
+
+    pub(crate) fn show_vehicle(&self) {
+        let vehicle = self.vehicle.state();
+        self.shared.change(|state| state.vehicle = vehicle);
+    }
+
     fn stop_what_nobody_watches(&mut self) {
+        if self.shared.silence() < self.device.dead_man {
+            return;
+        }
+        if self.vehicle.is_asked() {
+            self.vehicle.leave();
+            self.show_vehicle();
+        }
         let entries = self.shared.state().periodic;
-        if entries.is_empty() || self.shared.silence() < self.device.dead_man {
+        if entries.is_empty() {
             return;
         }
         let Some(lines) = &self.lines else { return };

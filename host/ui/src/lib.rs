@@ -19,6 +19,7 @@ mod shared;
 mod site;
 mod state;
 mod stream;
+mod vehicle;
 mod visits;
 
 pub use device::{Device, Hosted};

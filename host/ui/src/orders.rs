@@ -7,9 +7,9 @@ use cantap::wire::record::ErrorState;
 use cantap_signals::named::NamedFilter;
 use cantap_trace::filter::Filter;
 use cantap_work::advice;
-use cantap_work::channel_bitrate::ChannelBitrate;
 use cantap_work::channel_options::ChannelOptions;
 use cantap_work::live::Lines;
+use cantap_work::requested_rate::RequestedRate;
 use serde_json::{Value, json};
 
 use crate::bus::Bus;
@@ -100,6 +100,17 @@ impl Bus {
                 });
             }
             Request::Recover {} => self.recover()?,
+            Request::AskVehicle { on: false } => {
+                self.vehicle.leave();
+                self.show_vehicle();
+            }
+            Request::AskVehicle { .. } => {
+                self.sending_lines()?;
+                let first = self.lines.iter().flat_map(Lines::devices).find(|(board, _)| *board == 0);
+                let (_, device) = first.context("the first device is away; a vehicle is asked through it")?;
+                self.vehicle.begin(device)?;
+                self.show_vehicle();
+            }
         }
         Ok(json!({}))
     }
@@ -140,25 +151,28 @@ impl Bus {
         Ok(())
     }
 
-    fn set_bitrate(&mut self, channel: u8, bitrate_bps: u32) -> anyhow::Result<()> {
+    /// Another bit rate for a channel, in bit/s, or the one that is found by listening.
+    fn set_bitrate(&mut self, channel: u8, bitrate_bps: Option<u32>) -> anyhow::Result<()> {
         let state = self.shared.state();
-        if bitrate_bps < LEAST_BITRATE {
+        if let Some(bitrate_bps) = bitrate_bps
+            && bitrate_bps < LEAST_BITRATE
+        {
             bail!("{bitrate_bps} bit/s is no bit rate of a bus; give for example 500000");
         }
         if state.channels.iter().all(|open| open.channel != channel) {
             bail!("channel {channel} is not open; choose one that is");
         }
-        let rates = state.channels.iter().map(|open| ChannelBitrate {
-            channel: Some(open.channel),
-            bitrate_bps: if open.channel == channel { bitrate_bps } else { open.bitrate },
-        });
-        let mut open = self.device.open.clone();
-        open.timing.set_bit_rates(rates);
+        let mut open = self.at_rates(&state.channels);
+        open.timing.set_bit_rate_of(RequestedRate { channel: Some(channel), bitrate_bps });
         // The user has agreed to take part at another bit rate.
         open.mode = Some(Mode::ListenOnly);
         self.reconnect(open, self.device.filters.clone())?;
         let listens = if state.is_normal { ", and all channels only listen now" } else { "" };
-        self.note(format!("channel {channel} is at {bitrate_bps} bit/s{listens}"));
+        let now = self.shared.state().channels.into_iter().find(|open| open.channel == channel);
+        match now {
+            Some(now) => self.note(format!("channel {channel} is at {} bit/s{listens}", now.bitrate)),
+            None => self.note(format!("channel {channel} is away{listens}")),
+        }
         Ok(())
     }
 

@@ -51,8 +51,9 @@ pub enum Request {
     Bitrate {
         /// From 1.
         channel: u8,
-        /// Bit/s.
-        bitrate: u32,
+        /// Bit/s; without one, it is found by listening.
+        #[serde(default)]
+        bitrate: Option<u32>,
     },
     /// Receives only these frames, in candump's syntax; without any, all.
     Filters {
@@ -95,6 +96,11 @@ pub enum Request {
     },
     /// Brings channels that are bus-off back onto their buses.
     Recover {},
+    /// Asks a vehicle by OBD-II: who it is, its trouble codes, and its values again and again; or ends that.
+    AskVehicle {
+        /// Whether to ask.
+        on: bool,
+    },
 }
 
 impl Request {
@@ -107,7 +113,8 @@ impl Request {
             | Self::Send { .. }
             | Self::Periodic { .. }
             | Self::StopPeriodic { .. }
-            | Self::Recover {} => Role::Send,
+            | Self::Recover {}
+            | Self::AskVehicle { .. } => Role::Send,
         }
     }
 }
@@ -119,7 +126,12 @@ impl fmt::Display for Request {
         match self {
             Self::Record { name, .. } => write!(f, "record to {name:.MOST$}"),
             Self::StopRecording {} => f.write_str("end the recording"),
-            Self::Bitrate { channel, bitrate } => write!(f, "channel {channel} at {bitrate} bit/s"),
+            Self::Bitrate { channel, bitrate: Some(bitrate) } => {
+                write!(f, "channel {channel} at {bitrate} bit/s")
+            }
+            Self::Bitrate { channel, bitrate: None } => {
+                write!(f, "find the bit rate of channel {channel} by listening")
+            }
             Self::Filters { filters } if filters.is_empty() => f.write_str("no filters"),
             Self::Filters { filters } => {
                 write!(
@@ -138,6 +150,8 @@ impl fmt::Display for Request {
                 write!(f, "stop periodic entry {slot} of channel {channel}")
             }
             Self::Recover {} => f.write_str("join the bus again after bus-off"),
+            Self::AskVehicle { on: true } => f.write_str("ask the vehicle by OBD-II"),
+            Self::AskVehicle { .. } => f.write_str("ask the vehicle nothing any more"),
         }
     }
 }

@@ -26,6 +26,8 @@ pub struct State {
     pub recording: Option<RecordingState>,
     /// What the device sends by itself.
     pub periodic: Vec<PeriodicState>,
+    /// What a vehicle answers, once it was asked.
+    pub vehicle: Option<VehicleState>,
     /// How many pages are open.
     pub pages: usize,
     /// Why nothing is received any more, if so.
@@ -103,4 +105,34 @@ pub struct PeriodicState {
     pub frame: String,
     /// Milliseconds.
     pub period_ms: f64,
+}
+
+/// Of a vehicle that is asked by OBD-II.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct VehicleState {
+    /// Whether it is being asked.
+    pub is_asked: bool,
+    /// How that goes, in a sentence.
+    pub text: String,
+    /// Who it is, its trouble codes, its values.
+    pub rows: Vec<VehicleRow>,
+}
+
+/// What an ECU has answered.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct VehicleRow {
+    /// The parameter in hexadecimal, behind its service if that is not the one of current values; empty for trouble codes.
+    pub parameter: String,
+    /// What the value is.
+    pub name: String,
+    /// Where the ECU answers from.
+    pub ecu: String,
+    /// The latest value with its unit.
+    pub value: String,
+    /// Whether the ECU has answered the last time.
+    pub is_current: bool,
+    /// The least and the most so far, of numbers.
+    pub range: Option<(String, String)>,
 }

@@ -82,6 +82,13 @@ impl TimingOptions {
         self.bitrates = rates.into_iter().map(Into::into).collect();
     }
 
+    /// Requests a bit rate for one channel, from 1, instead of any other timing; the other channels keep theirs.
+    pub fn set_bit_rate_of(&mut self, rate: RequestedRate) {
+        self.exact = None;
+        self.bitrates.retain(|before| before.channel != rate.channel);
+        self.bitrates.push(rate);
+    }
+
     /// Whether any bit rate is to be found by listening.
     pub fn has_auto(&self) -> bool {
         self.bitrates.iter().any(RequestedRate::is_auto)

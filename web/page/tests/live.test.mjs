@@ -167,6 +167,42 @@ test('frames are sent once and periodically, after the user has agreed', () =>
     await until(page, 'it has stopped', () => !document.querySelector('#view-device').textContent.includes('7F1#0000'));
   }));
 
+test('a bit rate is found by listening, and found again only when it is asked for', () =>
+  live(['-d', 'virtual:car', '-b', '250k', '--allow', 'send'], 'device', async (page) => {
+    await page.getByRole('button', { name: 'Bit rate of channel 1: 250 kbit/s, change' }).click();
+    await page.getByRole('dialog').getByRole('button', { name: 'Find it by listening' }).click();
+    await page.getByRole('button', { name: 'Bit rate of channel 1: 500 kbit/s, change' }).waitFor();
+    await untilText(page, '.notices', 'channel 1 is at 500000 bit/s');
+    // Channels opened in another way keep it.
+    await page.getByRole('button', { name: 'Take part …' }).click();
+    await page.getByRole('dialog').getByRole('button', { name: 'Take part' }).click();
+    await untilText(page, '#live-mode', 'take part');
+    await page.getByRole('button', { name: 'Bit rate of channel 1: 500 kbit/s, change' }).waitFor();
+  }));
+
+test('a vehicle is asked for its values and trouble codes, by who may send and only while channels take part', () =>
+  live(['-d', 'virtual:car', '-b', '500k', '--allow', 'send'], 'device', async (page) => {
+    const ask = page.locator('#vehicle-ask');
+    assert.ok(await ask.isDisabled());
+    await page.getByRole('button', { name: 'Take part …' }).click();
+    await page.getByRole('dialog').getByRole('button', { name: 'Take part' }).click();
+    await untilText(page, '#live-mode', 'take part');
+    await ask.click();
+    await untilText(page, '#vehicle', 'engine_speed');
+    await untilText(page, '#vehicle', 'rpm');
+    await untilText(page, '#vehicle', 'vin');
+    await untilText(page, '#vehicle', 'P0');
+    await until(page, 'values come again, with the least and the most', () => [...document.querySelectorAll('#vehicle tr')].some((row) => row.cells[4].textContent !== row.cells[5].textContent));
+    await page.getByRole('button', { name: 'Only listen' }).click();
+    await untilText(page, '#live-mode', 'only listen');
+    await untilText(page, '#view-device', 'Nothing is asked any more');
+    assert.ok(await ask.isDisabled());
+    // What was asked is there to be looked at.
+    await show(page, 'conversations');
+    await page.getByLabel('Search conversations').fill('engine_speed');
+    await untilText(page, '#view-conversations .list-layer', 'engine_speed');
+  }));
+
 test('a send list is kept, saved as the live view reads it, and added from its files', () =>
   live(['-d', 'virtual', '-b', '500k', '--allow', 'send'], 'device', async (page, server) => {
     const lines = () => page.locator('#send-list tr td:first-child').allTextContents();

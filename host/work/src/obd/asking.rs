@@ -22,6 +22,8 @@ use crate::uds::TransferOptions;
 
 /// The tag of our frames: the scripts' are below.
 const TAG: u32 = 1 << 24;
+/// Trouble codes are asked for once in so many rounds: they change seldom.
+const ROUNDS_PER_CODES: u64 = 20;
 /// How long a frame may take to get onto the bus: the vehicle's own traffic may be before it.
 const PATIENCE: Duration = Duration::from_secs(3);
 
@@ -100,6 +102,8 @@ pub enum Asked {
 enum Step {
     Search,
     List,
+    /// Who the vehicle is and which trouble codes it has: the request at this place.
+    Standing(usize),
     /// The parameter at this place.
     Value(usize),
     Pause {
@@ -107,7 +111,7 @@ enum Step {
     },
 }
 
-/// Asks for all parameters, in rounds.
+/// Asks who the vehicle is, and then for its trouble codes and all parameters, in rounds.
 pub struct Asking {
     channel: Channel,
     /// Where else to try if nobody answers here.
@@ -128,6 +132,8 @@ pub struct Asking {
     under_way: VecDeque<(Frame, Instant)>,
     started: Instant,
     round_ns: u64,
+    /// Rounds begun.
+    rounds: u64,
     asked: Vec<Asked>,
     /// Nothing new begins, but what is on its way must end.
     is_leaving: bool,
@@ -157,6 +163,7 @@ impl Asking {
             under_way: VecDeque::new(),
             started: Instant::now(),
             round_ns: 0,
+            rounds: 0,
             asked: vec![Asked::State(AskingState::Searching { channel })],
             is_leaving: false,
             is_over: false,
@@ -282,6 +289,8 @@ impl Asking {
         let (request, servers) = match self.step {
             Step::Search => (self.vehicle.search()?, None),
             Step::List => self.vehicle.list().map(|(request, servers)| (request, Some(servers)))?,
+            // Not each ECU has each: whoever answers within the time does.
+            Step::Standing(place) => (self.standing().nth(place)?, None),
             Step::Value(place) => {
                 let pid = *self.parameters.get(place)?;
                 (self.vehicle.services().value(pid), Some(self.vehicle.having(pid)))
@@ -296,9 +305,19 @@ impl Asking {
     }
 
     fn begin_round(&mut self, now_ns: u64) {
-        (self.step, self.round_ns) = (Step::Value(0), now_ns);
+        let has_standing = self.rounds.is_multiple_of(ROUNDS_PER_CODES);
+        self.step = if has_standing { Step::Standing(0) } else { Step::Value(0) };
+        self.rounds += 1;
+        self.round_ns = now_ns;
         self.silent.clear();
         self.asked.push(Asked::Round);
+    }
+
+    /// The requests for trouble codes; the first time also for who the vehicle is.
+    fn standing(&self) -> impl Iterator<Item = Vec<u8>> + use<> {
+        let services = self.vehicle.services();
+        let identification = (self.rounds == 1).then(|| services.identification());
+        identification.into_iter().flatten().chain(services.codes().map(|(_, request)| request.to_vec()))
     }
 
     fn hand_over(&mut self, device: &Device) -> Result<(), DeviceError> {
@@ -363,6 +382,10 @@ impl Asking {
                 self.vehicle.take_list(answers);
                 self.list_is_known(now_ns);
             }
+            Step::Standing(place) => {
+                let is_last = place + 1 >= self.standing().count();
+                self.step = if is_last { Step::Value(0) } else { Step::Standing(place + 1) };
+            }
             Step::Value(place) => {
                 if answers.is_empty() {
                     self.silent.extend(self.parameters.get(place));
@@ -406,7 +429,8 @@ impl Asking {
     /// Hands out the answers to what is asked here; those about who is there are no values.
     fn show_answers(&mut self) {
         let options: TransferOptions = self.vehicle.transfer();
-        let is_value = matches!(self.step, Step::Value(_) | Step::Pause { .. }) && !self.is_leaving;
+        let is_value =
+            matches!(self.step, Step::Standing(_) | Step::Value(_) | Step::Pause { .. }) && !self.is_leaving;
         let events = self.events.drain(..);
         let own = events.filter(|event| is_value && options.is_ours(event) && is_answer(event));
         self.asked.extend(own.map(Asked::Answer));

@@ -12,7 +12,7 @@ use cantap_protocols::{Event, EventKind};
 
 pub use asking::{Asked, Asking, AskingState};
 pub use services::Services;
-pub use table::Table;
+pub use table::{Table, TableRow};
 pub use vehicle::Vehicle;
 
 /// Whether an event is an answer, or a broken one.

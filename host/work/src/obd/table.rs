@@ -51,6 +51,22 @@ impl Row {
         (group, &self.pid, &self.name, &self.ecu)
     }
 
+    /// Whether it was answered in this round; who the vehicle is and its trouble codes are not asked for in each.
+    fn is_current(&self, round: u64) -> bool {
+        self.round == round || self.order().0 < 2
+    }
+
+    fn shown(&self, round: u64) -> TableRow<'_> {
+        TableRow {
+            parameter: self.parameter(),
+            name: &self.name,
+            ecu: &self.ecu,
+            value: &self.value,
+            is_current: self.is_current(round),
+            range: self.range.map(|(min, max)| (rounded(min), rounded(max))),
+        }
+    }
+
     /// A parameter of another service than those of current values has that before it.
     fn parameter(&self) -> String {
         match self.service {
@@ -59,6 +75,23 @@ impl Row {
             service => format!("{service:02X} {}", self.pid),
         }
     }
+}
+
+/// A row of the table, for whoever draws it in another way than as lines of text.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TableRow<'a> {
+    /// The parameter in hexadecimal, behind its service if that is not the one of current values; empty for trouble codes.
+    pub parameter: String,
+    /// What the value is.
+    pub name: &'a str,
+    /// Where the ECU answers from.
+    pub ecu: &'a str,
+    /// The latest value with its unit.
+    pub value: &'a str,
+    /// Whether the ECU has answered the last time.
+    pub is_current: bool,
+    /// The least and the most so far, of numbers.
+    pub range: Option<(String, String)>,
 }
 
 /// Values by parameter and ECU, the latest of each.
@@ -119,26 +152,26 @@ impl Table {
         self.rows.is_empty()
     }
 
+    /// Its rows: who the vehicle is, then its trouble codes, then values in the order of their parameters.
+    pub fn rows(&self) -> Vec<TableRow<'_>> {
+        let mut rows: Vec<_> = self.rows.iter().collect();
+        rows.sort_by(|a, b| a.order().cmp(&b.order()));
+        rows.into_iter().map(|row| row.shown(self.round)).collect()
+    }
+
     /// The table's lines, none longer than `columns`; with the least and the most so far if `with_range`. In a narrow window names are shorter, and
     /// where that is not enough, the least and the most are left out. If there are more than `lines`, the last line says how many are missing.
     pub fn lines(&self, with_range: bool, (columns, lines): (usize, usize)) -> Vec<String> {
-        let mut rows: Vec<&Row> = self.rows.iter().collect();
-        rows.sort_by(|a, b| a.order().cmp(&b.order()));
         let mut cells = vec![vec!["PID".to_owned(), "name".to_owned(), "ECU".to_owned(), "value".to_owned()]];
         if with_range {
             cells[0].extend(["min".to_owned(), "max".to_owned()]);
         }
-        for row in rows {
-            let value = if row.round == self.round {
-                row.value.clone()
-            } else {
-                format!("no answer, was {}", row.value)
-            };
-            let mut line = vec![row.parameter(), row.name.clone(), row.ecu.clone(), value];
+        for TableRow { parameter, name, ecu, value, is_current, range } in self.rows() {
+            let value = if is_current { value.to_owned() } else { format!("no answer, was {value}") };
+            let mut line = vec![parameter, name.to_owned(), ecu.to_owned(), value];
             if with_range {
-                line.extend(
-                    row.range.map_or_else(Default::default, |(min, max)| [rounded(min), rounded(max)]),
-                );
+                let (min, max) = range.unwrap_or_default();
+                line.extend([min, max]);
             }
             cells.push(line);
         }
@@ -269,6 +302,23 @@ mod tests {
         let lines = table.lines(true, ROOM);
         assert!(lines[1].contains("no answer, was 900 rpm  900  900"), "{lines:?}");
         assert!(lines[2].contains("7E8  51 rpm") && lines[2].ends_with("50   51"), "{lines:?}");
+    }
+
+    #[test]
+    fn who_the_vehicle_is_and_its_codes_hold_until_they_are_asked_for_again() {
+        let mut table = table(&[("0C", 900.0)]);
+        table.put(Row {
+            service: 3,
+            pid: String::new(),
+            value: "P0301".to_owned(),
+            range: None,
+            ..row("", 0.0, 0)
+        });
+        table.put(Row { service: VEHICLE_INFORMATION, ..row("02", 0.0, 0) });
+        table.begin_round();
+        let current: Vec<_> =
+            table.rows().iter().map(|row| (row.parameter.clone(), row.is_current)).collect();
+        assert_eq!(current, [("09 02".to_owned(), true), (String::new(), true), ("0C".to_owned(), false)]);
     }
 
     #[test]

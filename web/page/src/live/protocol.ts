@@ -29,6 +29,18 @@ export interface PeriodicState {
   periodMs: number;
 }
 
+/** What an ECU has answered; the parameter is empty for trouble codes. */
+export interface VehicleRow {
+  parameter: string;
+  name: string;
+  ecu: string;
+  value: string;
+  /** It has answered the last time. */
+  isCurrent: boolean;
+  /** The least and the most so far, of numbers. */
+  range: [string, string] | null;
+}
+
 export interface State {
   maySend: boolean;
   /** Choose bit rates and filters. */
@@ -44,6 +56,8 @@ export interface State {
   /** With a condition, `events` says how often it came true; there is no file before. */
   recording: { name: string; records: number; bytes: number; seconds: number; condition: string | null; events: number } | null;
   periodic: PeriodicState[];
+  /** What a vehicle answers, once it was asked. */
+  vehicle: { isAsked: boolean; text: string; rows: VehicleRow[] } | null;
   pages: number;
   ended: string | null;
 }
@@ -55,13 +69,15 @@ export type Change = { counter: { byte: number; lowBit: number; bits: number } }
 export interface Requests {
   record: { in: { name: string; only: { around: string; beforeS: number; afterS: number } | null }; out: Record<string, never> };
   stopRecording: { in: Record<string, never>; out: Record<string, never> };
-  bitrate: { in: { channel: number; bitrate: number }; out: Record<string, never> };
+  /** Without a bit rate, it is found by listening. */
+  bitrate: { in: { channel: number; bitrate: number | null }; out: Record<string, never> };
   filters: { in: { filters: string[] }; out: Record<string, never> };
   mode: { in: { normal: boolean; confirmed: boolean }; out: Record<string, never> };
   send: { in: { channel: number; frame: string }; out: Record<string, never> };
   periodic: { in: { channel: number; frame: string; periodMs: number; modifiers: Change[] }; out: { slot: number } };
   stopPeriodic: { in: { channel: number; slot: number }; out: Record<string, never> };
   recover: { in: Record<string, never>; out: Record<string, never> };
+  askVehicle: { in: { on: boolean }; out: Record<string, never> };
 }
 
 /** JSON from the server. */

@@ -9,6 +9,7 @@ import { openDialog } from '../ui/dialog';
 import { button, el, field, replace, setText } from '../ui/dom';
 import { SendList } from './send-list';
 import { parseRate } from './summary';
+import { Vehicle } from './vehicle';
 import type { View } from './view';
 
 export class DeviceView implements View {
@@ -31,6 +32,7 @@ export class DeviceView implements View {
   readonly #keeper: HTMLElement;
   readonly #filtering: HTMLElement;
   readonly #send: SendList;
+  readonly #vehicle: Vehicle;
   #drawn = '';
 
   constructor(
@@ -41,6 +43,7 @@ export class DeviceView implements View {
   ) {
     this.#record = button('Record', () => this.toggleRecording(), { class: 'primary' });
     this.#send = new SendList(app, live);
+    this.#vehicle = new Vehicle(app, live);
     this.#recorder = el(
       'div',
       { attrs: { hidden: '' } },
@@ -61,12 +64,13 @@ export class DeviceView implements View {
       { class: 'view view-device', attrs: { 'aria-label': 'Device' } },
       el(
         'div',
-        { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Device and sending' } },
+        { class: 'page-scroll', attrs: { tabindex: 0, role: 'group', 'aria-label': 'Device, sending and vehicle' } },
         section('Connection', this.#connection, this.#devices),
         section('Channels', el('table', { class: 'numbers' }, el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#channels), this.#mode),
         section('Recording', this.#recorder, this.#keeper),
         this.#filtering,
         section('Send', this.#send.element),
+        section('Vehicle', this.#vehicle.element),
       ),
     );
     this.#name.value = proposedName();
@@ -75,6 +79,7 @@ export class DeviceView implements View {
       { id: 'live.record', title: 'Recording: begin or end', keys: ['R'], run: () => this.toggleRecording() },
       { id: 'live.listen', title: 'Device: only listen', run: () => this.#setMode(false) },
       { id: 'live.normal', title: 'Device: take part in the bus', run: () => this.#askNormal() },
+      { id: 'live.vehicle', title: 'Vehicle: ask by OBD-II, or end that', run: () => this.#vehicle.toggle() },
     );
     this.#draw();
   }
@@ -133,6 +138,10 @@ export class DeviceView implements View {
           return true;
         },
       },
+      {
+        label: 'Find it by listening',
+        run: () => void this.live.ask('bitrate', { channel, bitrate: null }).catch(this.#refused),
+      },
       { label: 'Cancel' },
     ]);
     input.select();
@@ -151,6 +160,7 @@ export class DeviceView implements View {
     this.#filtering.hidden = !state.mayConfigure;
     this.#drawRecording(state);
     this.#send.draw(state);
+    this.#vehicle.draw(state);
     const key = JSON.stringify([state.devices, state.channels, state.isNormal, state.maySend, state.mayConfigure, state.filters, state.ended]);
     if (key === this.#drawn) return;
     this.#drawn = key;

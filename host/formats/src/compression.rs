@@ -32,6 +32,22 @@ pub(crate) const MAGIC_BYTES: usize = 4;
 /// An xz file says how much memory unpacking takes; `xz -9` takes 65 MiB. More than this is damage or malice.
 const XZ_MEMORY_KIB: u32 = 256 * 1024;
 
+/// Reads Zstandard.
+#[cfg(feature = "zstd")]
+pub(crate) fn unpack_zstd<'a>(source: impl Read + Send + 'a) -> io::Result<impl Read + Send + 'a> {
+    zstd::stream::read::Decoder::new(source)
+}
+
+#[cfg(all(feature = "zstd-in-rust", not(feature = "zstd")))]
+pub(crate) fn unpack_zstd<'a>(source: impl Read + Send + 'a) -> io::Result<impl Read + Send + 'a> {
+    Ok(crate::zstd_frames::Frames::new(source))
+}
+
+#[cfg(not(any(feature = "zstd", feature = "zstd-in-rust")))]
+pub(crate) fn unpack_zstd<'a>(_: impl Read + Send + 'a) -> io::Result<io::Empty> {
+    Err(without_zstd())
+}
+
 /// The error for such a file in a build without zstd.
 #[cfg(not(feature = "zstd"))]
 pub(crate) fn without_zstd() -> io::Error {
@@ -75,10 +91,7 @@ impl Compression {
     pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
         Ok(match self {
             Self::Gzip => Box::new(flate2::read::MultiGzDecoder::new(source)),
-            #[cfg(feature = "zstd")]
-            Self::Zstd => Box::new(zstd::stream::read::Decoder::new(source)?),
-            #[cfg(not(feature = "zstd"))]
-            Self::Zstd => return Err(without_zstd()),
+            Self::Zstd => Box::new(unpack_zstd(source)?),
             Self::Xz => Box::new(XzStreams::new(source)),
             Self::Lz4 => Box::new(lz4::Unpacker::new(source)),
             Self::Bzip2 => Box::new(bzip2::read::MultiBzDecoder::new(source)),

@@ -93,6 +93,9 @@ mod utf16;
 mod whole;
 mod writer;
 mod zone;
+// Where both features are, the library reads.
+#[cfg(all(feature = "zstd-in-rust", any(test, not(feature = "zstd"))))]
+mod zstd_frames;
 
 pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};

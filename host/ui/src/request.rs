@@ -96,7 +96,7 @@ pub enum Request {
     },
     /// Brings channels that are bus-off back onto their buses.
     Recover {},
-    /// Asks a vehicle by OBD-II: who it is, its trouble codes, and its values again and again; or ends that.
+    /// Asks a vehicle by OBD-II for its VIN, trouble codes and values, again and again; or ends that.
     AskVehicle {
         /// Whether to ask.
         on: bool,

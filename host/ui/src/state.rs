@@ -115,7 +115,7 @@ pub struct VehicleState {
     pub is_asked: bool,
     /// How that goes, in a sentence.
     pub text: String,
-    /// Who it is, its trouble codes, its values.
+    /// Its VIN, trouble codes and values.
     pub rows: Vec<VehicleRow>,
 }
 

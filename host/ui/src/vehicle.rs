@@ -1,4 +1,4 @@
-//! Asks a vehicle by OBD-II for the pages: who it is, its trouble codes, its values. It is asked on the first device, and only while channels take part in
+//! Asks a vehicle by OBD-II for the pages: its VIN, trouble codes and values. It is asked on the first device, and only while channels take part in
 //! their buses and a page is there.
 
 use std::time::Duration;

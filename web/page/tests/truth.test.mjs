@@ -169,3 +169,19 @@ for (const [name, trace] of Object.entries(TRACES)) {
     assert.equal(Buffer.from(out.bytes).toString(), cantap('convert', path, '-', '--to', 'candump'));
   });
 }
+
+test('a trace in zstd is the trace, whole or cut', async () => {
+  const [plain, packed] = ['zstd.log', 'zstd.log.zst'].map((name) => join(folder, name));
+  writeFileSync(plain, TRACES.lossy.text);
+  cantap('convert', plain, packed);
+  const { ask } = await start(wasm);
+  const opened = (bytes) => {
+    ask('open', { name: 'zstd.log.zst', more: false, size: bytes.byteLength }, bytes);
+    return ask('summary', {});
+  };
+  const bytes = new Uint8Array(readFileSync(packed));
+  const { frames } = JSON.parse(cantap('stats', plain, '--json'));
+  assert.equal(opened(bytes).frames, frames);
+  const cut = opened(bytes.subarray(0, bytes.length / 2));
+  assert.ok(cut.frames < frames);
+});

@@ -7,6 +7,7 @@ use cantap_trace::counted;
 use flate2::{Decompress, FlushDecompress, Status};
 use serde::{Deserialize, Serialize};
 
+use super::super::compression;
 use super::super::cores;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
@@ -78,10 +79,7 @@ fn unpack(stored: &[u8], at: u64, len: u64, packed: Packed) -> Result<Vec<u8>, F
     let len = len as usize;
     let (bytes, is_whole) = match packed.kind & !1 {
         0 => inflate(stored, len),
-        #[cfg(feature = "zstd")]
-        2 => read_whole(zstd::stream::read::Decoder::new(stored)?, stored.len(), len),
-        #[cfg(not(feature = "zstd"))]
-        2 => return Err(crate::compression::without_zstd().into()),
+        2 => read_whole(compression::unpack_zstd(stored)?, stored.len(), len),
         _ => read_whole(lz4_flex::frame::FrameDecoder::new(stored), stored.len(), len),
     };
     if !is_whole || bytes.len() != len {

@@ -102,7 +102,7 @@ pub enum Asked {
 enum Step {
     Search,
     List,
-    /// Who the vehicle is and which trouble codes it has: the request at this place.
+    /// The VIN and trouble codes: the request at this place.
     Standing(usize),
     /// The parameter at this place.
     Value(usize),
@@ -111,7 +111,7 @@ enum Step {
     },
 }
 
-/// Asks who the vehicle is, and then for its trouble codes and all parameters, in rounds.
+/// Asks for the VIN, trouble codes and all parameters, in rounds.
 pub struct Asking {
     channel: Channel,
     /// Where else to try if nobody answers here.
@@ -313,11 +313,12 @@ impl Asking {
         self.asked.push(Asked::Round);
     }
 
-    /// The requests for trouble codes; the first time also for who the vehicle is.
+    /// The requests for trouble codes; the first time also for the VIN.
     fn standing(&self) -> impl Iterator<Item = Vec<u8>> + use<> {
         let services = self.vehicle.services();
-        let identification = (self.rounds == 1).then(|| services.identification());
-        identification.into_iter().flatten().chain(services.codes().map(|(_, request)| request.to_vec()))
+        let [vin, ..] = services.identification();
+        let vin = (self.rounds == 1).then_some(vin);
+        vin.into_iter().chain(services.codes().map(|(_, request)| request.to_vec()))
     }
 
     fn hand_over(&mut self, device: &Device) -> Result<(), DeviceError> {

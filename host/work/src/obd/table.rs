@@ -8,6 +8,9 @@ use crate::cut::cut;
 
 /// Fields that say what was asked, and not what was answered.
 const OF_THE_QUESTION: [&str; 4] = ["sid", "pid", "did", "asked"];
+/// Trouble codes of each kind: their number, and the list.
+const COUNT: &str = "trouble_codes";
+const LIST: &str = "codes";
 /// Decimals of a value; more are the conversion's and not the sensor's.
 const DECIMALS: i32 = 3;
 /// Services with values that are read again and again, in OBD-II and over UDS.
@@ -115,8 +118,12 @@ impl Table {
         let pid = event.field("pid").or_else(|| event.field("did"));
         let pid = pid.map_or_else(String::new, |field| number_text(&field.value));
         let (ecu, round) = (event.to.to_string(), self.round);
-        let mut values =
-            event.fields.iter().filter(|field| !OF_THE_QUESTION.contains(&&*field.name)).peekable();
+        let is_value = |field: &&Field| {
+            // How many trouble codes there are is seen by their list.
+            let is_count = pid.is_empty() && field.name == COUNT && event.field(LIST).is_some();
+            !is_count && !OF_THE_QUESTION.contains(&&*field.name)
+        };
+        let mut values = event.fields.iter().filter(is_value).peekable();
         if values.peek().is_none() {
             let (name, value) = (event.title.to_string(), "–".to_owned());
             self.put(Row { service, pid, name, ecu, value, range: None, round });
@@ -125,6 +132,7 @@ impl Table {
         for field in values {
             // Trouble codes of each kind have the same fields.
             let name = match pid.as_str() {
+                "" if field.name == LIST => event.title.to_string(),
                 "" => format!("{}: {}", event.title, field.name),
                 _ => field.name.to_string(),
             };

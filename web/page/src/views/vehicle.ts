@@ -1,4 +1,4 @@
-// A vehicle, asked by OBD-II through the device: who it is, its trouble codes, its values.
+// A vehicle, asked by OBD-II through the device: its VIN, trouble codes and values.
 
 import type { App } from '../model/app';
 import type { Connection } from '../live/connection';
@@ -20,7 +20,7 @@ export class Vehicle {
     this.#ask = button('Ask the vehicle', () => this.toggle(), { id: 'vehicle-ask' });
     const head = ['Parameter', 'Name', 'ECU', 'Value', 'Least', 'Most'];
     this.#table = el('table', { class: 'numbers', attrs: { hidden: '' } }, el('thead', {}, el('tr', {}, ...head.map((h) => el('th', { attrs: { scope: 'col' } }, h)))), this.#rows);
-    this.element = el('div', {}, el('div', { class: 'row' }, this.#ask, el('span', { class: 'muted' }, 'By OBD-II: who it is, its trouble codes, and its values once a second until you end it. Requests and answers are in the trace and among the conversations.')), this.#text, this.#table);
+    this.element = el('div', {}, el('div', { class: 'row' }, this.#ask, el('span', { class: 'muted' }, 'By OBD-II: its VIN and trouble codes, and its values once a second until you end it. Requests and answers are in the trace and among the conversations.')), this.#text, this.#table);
   }
 
   toggle(): void {

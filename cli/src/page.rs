@@ -63,10 +63,11 @@ pub fn with(page: &str, element: &str, object: &Value) -> anyhow::Result<String>
     Ok(format!("{before}<script type=\"application/json\" id=\"{element}\">{object}</script>{after}"))
 }
 
-/// What a page is told that is live from devices, served by `command`.
+/// What a page is told that is live from devices, served by `command`, with descriptions besides the databases.
 pub fn about_devices(
     addresses: &[Address],
     options: &DatabaseOptions,
+    described: Vec<Carried>,
     command: &str,
 ) -> anyhow::Result<Value> {
     let mut databases = databases(&options.paths)?;
@@ -74,6 +75,7 @@ pub fn about_devices(
         let car = Carried::new("car.dbc", cantap_virtual::car::DATABASE.as_bytes())?;
         databases.push(car.with("channel", Value::Null));
     }
+    databases.extend(described);
     let names: Vec<_> = addresses.iter().map(ToString::to_string).collect();
     let databases: Vec<_> = databases.into_iter().map(Carried::into_object).collect();
     Ok(json!({

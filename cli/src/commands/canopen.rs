@@ -37,7 +37,7 @@ use crate::usage_error::usage;
 pub struct Args {
     #[command(flatten)]
     speak: SpeakArgs,
-    /// The sheet (EDS or DCF) of nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
+    /// The sheet (EDS, DCF, XDD or XDC) of nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE", global = true)]
     sheets: Vec<SheetPath>,
     /// How long to wait for each answer; default 1s, or 100ms for LSS.

@@ -32,6 +32,7 @@ use crate::completion;
 use crate::database_args::DatabaseArgs;
 use crate::input::resolved;
 use crate::live_args::AUTO_NEEDS_A_DEVICE;
+use crate::protocols::ProtocolArgs;
 use crate::trace_output::{named, refuse_older, refuse_unwritten};
 use crate::usage_error::usage;
 
@@ -62,6 +63,8 @@ pub struct Args {
     normal: bool,
     #[command(flatten)]
     databases: DatabaseArgs,
+    #[command(flatten)]
+    protocol: ProtocolArgs,
     /// Show only these frames, in candump's syntax; with a database also EngineData. Can be repeated. Recordings contain all frames.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<NamedFilter>,
@@ -130,7 +133,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let options = ChannelBitrate::options(&open.timing.known());
     let filters = filters(args, &profile, &decoder, &mut report)?;
-    let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
+    let model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
+    // What is wrong with a description is said before the view opens, and above all what it would not show.
+    let mut model = model.with_conversations(args.protocol.options(false)?);
     model.history.set_filters(filters, None);
     for name in &profile.graph {
         if let Err(error) = model.seen.signals.choose(name) {

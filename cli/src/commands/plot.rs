@@ -3,16 +3,19 @@
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cantap::Id;
+use cantap::{Id, TraceRecord};
 use cantap_analysis::plot::{
-    Axis, Content, DEFAULT_WIDTH, LoadCollector, MOST_CURVES, PictureFormat, Plot, SignalCollector,
-    TextStyle, TimingCollector,
+    Axis, Content, DEFAULT_WIDTH, LoadCollector, MOST_CURVES, NamedValue, PictureFormat, Plot,
+    SignalCollector, TextStyle, TimingCollector,
 };
-use cantap_analysis::stats::Options;
+use cantap_analysis::stats;
 use cantap_formats::time_range::date_text;
+use cantap_protocols::{FieldSelection, FieldValue, Options, ReadItem};
+use cantap_signals::Decoder;
 use cantap_trace::filter::Filter;
 use cantap_trace::grammar;
 
@@ -20,6 +23,7 @@ use crate::args;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load, load_selected};
 use crate::input::{ReadArgs, filtered};
+use crate::protocols::{ProtocolArgs, reading};
 use crate::range_args::RangeArgs;
 use crate::trace_output::failed;
 use crate::usage_error::usage;
@@ -34,7 +38,8 @@ use serde_json::json;
                 cantap plot trace.log --db car.dbc --signal Speed --signal 'Engine.*' \\\n      \
                 -o drive.svg\n  \
                 cantap plot trace.log --bus-load -b 500k --window 100ms -o load.png\n  \
-                cantap plot trace.log --timing 123\n\n\
+                cantap plot trace.log --timing 123\n  \
+                cantap plot boat.log --signal nmea2000.speed --signal 'j1939.engine_*'\n\n\
                 Without -o the picture is drawn in the terminal. Where frames were lost, curves are interrupted and the \
                 place is shaded.")]
 pub struct Args {
@@ -43,7 +48,10 @@ pub struct Args {
     input: PathBuf,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Signals to draw, by name or Message.Signal; with *, ? and [a-z]. Can be repeated. Default: all.
+    #[command(flatten)]
+    protocol: ProtocolArgs,
+    /// Signals to draw, by name or Message.Signal, and values of protocols, by the names that conditions have (j1939.engine_speed, obd.*); with *, ?
+    /// and [a-z]. Can be repeated. Default: all signals.
     #[arg(short, long = "signal", value_name = "PATTERN", add = completion::signals())]
     signals: Vec<String>,
     /// Draw the bus load over time, or frames/s if no bit rate is given and the trace says none.
@@ -144,7 +152,7 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
             ));
         }
         let data = ChannelBitrate::options(&args.data_bitrates);
-        let options = Options {
+        let options = stats::Options {
             window: args.window,
             data_bitrate_bps: data.bitrate_bps,
             channel_data_bitrate_bps: data.channel_bitrate_bps,
@@ -186,16 +194,43 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
         }
         return Ok((plot, read));
     }
-    if args.databases.is_empty() {
+    let mut fields = FieldSelection::default();
+    let mut signals = Vec::new();
+    for pattern in &args.signals {
+        if !fields.add(pattern).context("--signal")? {
+            signals.push(pattern.clone());
+        }
+    }
+    if args.databases.is_empty() && fields.is_empty() {
         return Err(usage(
-            "no database to find signals in; give one with --db FILE, or ask for --bus-load or --timing ID",
+            "no database to find signals in; give one with --db FILE, name a protocol's value (--signal obd.engine_speed), or ask for \
+             --bus-load or --timing ID",
         ));
     }
-    let decoder = load_selected(&args.databases.options(), args.read.strict, args.quiet, &args.signals)?;
-    let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
-    let mut read = for_each(args, args.read.filters(&decoder)?, |_, record| collector.push(record))?;
+    // With values of protocols alone, the database serves their names.
+    let decoder = if signals.is_empty() && !fields.is_empty() {
+        load(&args.databases.options(), args.read.strict, args.quiet)?
+    } else {
+        load_selected(&args.databases.options(), args.read.strict, args.quiet, &signals)?
+    };
+    let none = Decoder::new(Vec::new());
+    let drawn = if signals.is_empty() && !fields.is_empty() { &none } else { &decoder };
+    let mut collector = SignalCollector::new(drawn).with_most_curves(args.curves);
+    let filters = args.read.filters(&decoder)?;
+    let mut read = if fields.is_empty() {
+        for_each(args, filters, |_, record| collector.push(record))?
+    } else {
+        let decoder = if args.databases.is_empty() { None } else { Some(Arc::new(decoder.clone())) };
+        with_fields(args, filters, decoder, &mut fields, &mut collector)?
+    };
+    for pattern in fields.unmatched() {
+        eprintln!(
+            "cantap: nothing had a number {pattern}; `cantap conversations` shows what there is, with its names"
+        );
+    }
     if collector.is_empty() {
-        bail!("none of the signals is in {name}{}; `cantap decode` shows what is", within(args));
+        let shows = if fields.is_empty() { "decode" } else { "conversations" };
+        bail!("none of the signals is in {name}{}; `cantap {shows}` shows what is", within(args));
     }
     read.not_drawn = collector.left_out();
     if read.not_drawn > 0 {
@@ -207,17 +242,55 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     Ok((dated(collector.finish(title("signals")), read.first_ns), read))
 }
 
+/// Reads the part of the trace to be drawn also by the protocols of the selected fields.
+fn with_fields(
+    args: &Args,
+    filters: Vec<Filter>,
+    decoder: Option<Arc<Decoder>>,
+    fields: &mut FieldSelection,
+    collector: &mut SignalCollector<'_>,
+) -> anyhow::Result<Read> {
+    let options = Options { protocols: fields.protocols(), ..args.protocol.options(args.quiet)? };
+    let mut reading = reading(options, decoder, args.quiet);
+    let mut take = |records: &[TraceRecord], more| {
+        let Ok(()) = reading.take_both(records, more, |item| {
+            match item {
+                ReadItem::Record(record) => collector.push(record),
+                ReadItem::Event(event) => {
+                    for FieldValue { name, parts, unit, value, text } in fields.take(&event) {
+                        let (time_ns, channel) = (event.time_ns, event.channel);
+                        let (name, parts) = (name.as_str(), &parts[..]);
+                        collector.push_named(&NamedValue {
+                            time_ns,
+                            channel,
+                            name,
+                            parts,
+                            unit,
+                            value,
+                            text,
+                        });
+                    }
+                }
+                ReadItem::Announcement(_) => {}
+            }
+            Ok::<_, std::convert::Infallible>(())
+        });
+    };
+    let read = for_each(args, filters, |_, record| take(std::slice::from_ref(record), true))?;
+    take(&[], false);
+    Ok(read)
+}
+
 /// Where nothing was found, if that is only a part of the trace.
 fn within(args: &Args) -> &'static str {
     if args.range.is_given() { " between --start and --end" } else { "" }
 }
 
-/// Reads the part of the trace to be drawn.
-/// Reads the trace. `take` also gets the bit rates that the trace has said so far.
+/// Reads the part of the trace to be drawn. `take` also gets the bit rates that the trace has said so far.
 fn for_each(
     args: &Args,
     filters: Vec<Filter>,
-    mut take: impl FnMut(&[(u8, u32)], &cantap::TraceRecord),
+    mut take: impl FnMut(&[(u8, u32)], &TraceRecord),
 ) -> anyhow::Result<Read> {
     let mut records = args.read.open(&args.input, filters)?.within(args.range.of(Some(&args.input))?)?;
     let mut batch = Vec::new();

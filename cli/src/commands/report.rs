@@ -15,6 +15,7 @@ use serde_json::json;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::page::{self, Carried};
+use crate::protocols::DescriptionArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -35,6 +36,8 @@ pub struct Args {
     output: Option<PathBuf>,
     #[command(flatten)]
     databases: DatabaseArgs,
+    #[command(flatten)]
+    described: DescriptionArgs,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel. Can be repeated. Without it
     /// there is no bus load.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
@@ -66,7 +69,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     // Only so that faults are reported here rather than to the reader of the page.
     load(&args.databases.options(), false, args.quiet)?;
-    let databases = page::databases(&args.databases.options().paths)?;
+    let mut databases = page::databases(&args.databases.options().paths)?;
+    databases.extend(args.described.carried(args.quiet)?);
     let read = trace::read(&args.input)?;
     let mut findings = Vec::new();
     if let Some(against) = &args.against {

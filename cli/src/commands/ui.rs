@@ -27,6 +27,7 @@ use crate::database_args::{DatabaseArgs, load};
 use crate::input::resolved;
 use crate::live_args::for_listening;
 use crate::page::{self, Carried};
+use crate::protocols::DescriptionArgs;
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -60,6 +61,8 @@ pub struct Args {
     open: ChannelArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
+    #[command(flatten)]
+    described: DescriptionArgs,
     /// Receive only these frames, in candump's syntax; with a database also EngineData. Repeat for any of several. The page can change it.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<NamedFilter>,
@@ -143,7 +146,7 @@ impl Args {
             "kind": "trace",
             "name": name,
             "size": size,
-            "databases": objects(page::databases(&options.paths)?),
+            "databases": objects(page::databases(&options.paths)?.into_iter().chain(self.described.carried(self.quiet)?)),
             "bitrates": bitrates,
         });
         Ok((Source::Trace(path.to_owned()), about))
@@ -169,7 +172,8 @@ impl Args {
             .map_err(|error| for_listening(error.into(), given, "without a trace to show"))?;
         let options = self.databases.or_of(boards.addresses());
         let decoder = load(&options, false, self.quiet)?;
-        let about = page::about_devices(boards.addresses(), &options, "cantap ui")?;
+        let described = self.described.carried(self.quiet)?;
+        let about = page::about_devices(boards.addresses(), &options, described, "cantap ui")?;
         let folder = std::env::current_dir().context("there is no working folder for recordings")?;
         let device = Device {
             boards,
@@ -186,6 +190,6 @@ impl Args {
     }
 }
 
-fn objects(databases: Vec<Carried>) -> Vec<Value> {
-    databases.into_iter().map(Carried::into_object).collect()
+fn objects(databases: impl Iterator<Item = Carried>) -> Vec<Value> {
+    databases.map(Carried::into_object).collect()
 }

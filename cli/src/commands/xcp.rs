@@ -130,12 +130,15 @@ enum Resource {
 }
 
 impl Resource {
-    const fn mask(self) -> u8 {
-        match self {
-            Self::Calibration => 0x01,
-            Self::Daq => 0x04,
-            Self::Stim => 0x08,
-            Self::Programming => 0x10,
+    /// Its bit. CCP has others, and no stimulation.
+    const fn mask(self, is_ccp: bool) -> u8 {
+        match (self, is_ccp) {
+            (Self::Calibration, _) => 0x01,
+            (Self::Daq, false) => 0x04,
+            (Self::Daq, true) => 0x02,
+            (Self::Stim, _) => 0x08,
+            (Self::Programming, false) => 0x10,
+            (Self::Programming, true) => 0x40,
         }
     }
 }
@@ -183,8 +186,8 @@ impl Args {
         if !is_ccp && (self.station.is_some() || self.order.is_some()) {
             return Err(usage("--station and --order are for --protocol ccp"));
         }
-        if is_ccp && !self.unlock.is_empty() {
-            return Err(usage("keys are sent by XCP only; leave --unlock out"));
+        if is_ccp && self.unlock.contains(&Resource::Stim) {
+            return Err(usage("CCP has no stimulation; it unlocks calibration, daq and programming"));
         }
         let described = description.and_then(|one| if is_ccp { one.ccp() } else { one.xcp() });
         let Some(parties) = self.pair.or(described) else {
@@ -239,9 +242,6 @@ impl Args {
             {
                 Err(usage("--json and --csv are two ways to print; choose one"))
             }
-            What::Daq(_) if self.protocol == Spoken::Ccp => {
-                Err(usage("lists are started by XCP only; use poll for CCP"))
-            }
             What::Daq(_) => targets.iter().try_for_each(Target::check_sampled),
             _ => Ok(()),
         }
@@ -290,7 +290,7 @@ impl Args {
     fn unlock(&self, master: &mut Master<'_>) -> anyhow::Result<()> {
         let Some(command) = &self.key_command else { return Ok(()) };
         for resource in &self.unlock {
-            let seed = master.seed(resource.mask())?;
+            let seed = master.seed(resource.mask(self.protocol == Spoken::Ccp))?;
             // It is not protected.
             if seed.is_empty() {
                 continue;

@@ -4,11 +4,13 @@
 mod known;
 mod sheet;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use anyhow::Context as _;
 use cantap_protocols::Options;
 use cantap_protocols::calibration::{Known as KnownConnections, MasterSlave};
+use cantap_protocols::dsdl::DsdlSource;
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
@@ -22,14 +24,33 @@ use clap::Arg;
 pub use self::known::{Known, named};
 pub use self::sheet::SheetPath;
 
+use crate::page::{self, Carried};
 use crate::stderr;
+use crate::usage_error::usage;
 
 /// What helps to understand a bus; commands flatten this into their arguments.
 #[derive(Clone, Debug, Default, clap::Args)]
 pub struct ProtocolArgs {
     #[arg(long = "pair", value_name = "ID:ID|MAKER", help = pair_help())]
     pairs: Vec<KnownPairs>,
-    /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), only for that node. Can be
+    #[command(flatten)]
+    described: DescriptionArgs,
+    /// The identifiers of an XCP master and its slave, as 7F0:7F1, if they were connected before the trace begins. Can be repeated.
+    #[arg(long = "xcp", value_name = "MASTER:SLAVE")]
+    xcp: Vec<MasterSlave>,
+    /// The same for CCP.
+    #[arg(long = "ccp", value_name = "MASTER:SLAVE")]
+    ccp: Vec<MasterSlave>,
+    /// The data type of a subject of Cyphal, as 1620=uavcan.si.sample.voltage.Scalar.1.0. Can be repeated. Others are those that nodes name in their
+    /// registers, or bytes.
+    #[arg(long = "subject", value_name = "NUMBER=TYPE")]
+    subjects: Vec<SubjectType>,
+}
+
+/// Files that describe what is on a bus; commands flatten this into their arguments.
+#[derive(Clone, Debug, Default, clap::Args)]
+pub struct DescriptionArgs {
+    /// The sheet (EDS, DCF, XDD or XDC) of CANopen nodes; with a node's number before it (5:drive.eds), only for that node. Can be
     /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
     sheets: Vec<SheetPath>,
@@ -40,20 +61,38 @@ pub struct ProtocolArgs {
     /// The description (A2L) of an ECU: names and values of what is measured and calibrated by XCP and CCP. Can be repeated.
     #[arg(long = "a2l", value_name = "FILE")]
     a2l: Vec<PathBuf>,
-    /// The identifiers of an XCP master and its slave, as 7F0:7F1, if they were connected before the trace begins. Can be repeated.
-    #[arg(long = "xcp", value_name = "MASTER:SLAVE")]
-    xcp: Vec<MasterSlave>,
-    /// The same for CCP.
-    #[arg(long = "ccp", value_name = "MASTER:SLAVE")]
-    ccp: Vec<MasterSlave>,
     /// A folder with data types of DroneCAN or Cyphal (DSDL), in addition to the public ones: the one in which the outermost namespaces are. Can be
     /// repeated.
     #[arg(long = "dsdl", value_name = "FOLDER")]
     dsdl: Vec<PathBuf>,
-    /// The data type of a subject of Cyphal, as 1620=uavcan.si.sample.voltage.Scalar.1.0. Can be repeated. Others are those that nodes name in their
-    /// registers, or bytes.
-    #[arg(long = "subject", value_name = "NUMBER=TYPE")]
-    subjects: Vec<SubjectType>,
+}
+
+impl DescriptionArgs {
+    /// The files, to be put into a page. What is not understood in them is reported on standard error, unless `quiet`.
+    pub fn carried(&self, quiet: bool) -> anyhow::Result<Vec<Carried>> {
+        // A page is shown to others: faults belong here.
+        ProtocolArgs { described: self.clone(), ..ProtocolArgs::default() }.options(quiet)?;
+        let bytes =
+            |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
+        let mut carried = Vec::new();
+        for sheet in &self.sheets {
+            carried.push(Carried::new(&sheet.name(), &bytes(sheet.path())?)?);
+        }
+        for odx in &self.odx {
+            if odx.layer().is_some() {
+                return Err(usage("a page takes whole files; leave out the layer of --odx"));
+            }
+        }
+        for path in self.odx.iter().map(OdxPath::path).chain(self.a2l.iter().map(PathBuf::as_path)) {
+            carried.push(Carried::new(&page::file_name(path).unwrap_or_default(), &bytes(path)?)?);
+        }
+        for folder in &self.dsdl {
+            for DsdlSource { path, text } in dsdl::read_folder(folder)? {
+                carried.push(Carried::new(&path, text.as_bytes())?);
+            }
+        }
+        Ok(carried.into_iter().map(|file| file.with("channel", serde_json::Value::Null)).collect())
+    }
 }
 
 fn pair_help() -> String {
@@ -73,16 +112,17 @@ impl ProtocolArgs {
     /// The library's options; what is not understood in a sheet or description is reported on standard error, unless
     /// `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
-        let sheets = self.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
-        let descriptions = odx::load(&self.odx, &reporter(quiet))?;
+        let sheets =
+            self.described.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
+        let descriptions = odx::load(&self.described.odx, &reporter(quiet))?;
         let mut pairs = self.pairs.clone();
         pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
         let calibration = KnownConnections {
             xcp: self.xcp.clone(),
             ccp: self.ccp.clone(),
-            descriptions: a2l::load(&self.a2l, &reporter(quiet))?,
+            descriptions: a2l::load(&self.described.a2l, &reporter(quiet))?,
         };
-        let types = dsdl::load(&self.dsdl, &self.subjects, &reporter(quiet))?;
+        let types = dsdl::load(&self.described.dsdl, &self.subjects, &reporter(quiet))?;
         Ok(Options { pairs, sheets, descriptions, calibration, types, ..Options::default() })
     }
 }

@@ -1,6 +1,6 @@
 //! The sheets of CANopen nodes, as given.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::Arc;
 
@@ -30,6 +30,17 @@ impl FromStr for SheetPath {
 }
 
 impl SheetPath {
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The file's name without its folder, behind the node's number, if it was given.
+    pub fn name(&self) -> String {
+        let name = self.path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
+        self.node.map_or_else(|| name.clone(), |node| format!("{node}:{name}"))
+    }
+
     /// Reads the file; what is not understood is reported on standard error, unless `quiet`.
     pub fn load(&self, quiet: bool) -> anyhow::Result<Sheet> {
         let name = self.path.display();
@@ -37,7 +48,7 @@ impl SheetPath {
         let eds = Eds::parse(&bytes);
         anyhow::ensure!(
             !eds.objects.is_empty(),
-            "{name} is not an EDS or DCF: there is no object in it; give the file that came with the device"
+            "{name} is not an EDS, DCF, XDD or XDC: there is no object in it; give the file that came with the device"
         );
         if !quiet {
             for issue in &eds.issues {

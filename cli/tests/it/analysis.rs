@@ -154,6 +154,57 @@ fn pictures_are_written_in_the_format_of_their_suffix() {
     assert!(reason.contains("no two frames of 7FF"), "{reason}");
 }
 
+/// `decode --protocols` and conditions had them, a picture needed a database.
+#[test]
+fn values_of_protocols_are_drawn_by_the_names_that_conditions_have() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("boat.svg");
+    let curves = |command: &mut std::process::Command| -> Vec<String> {
+        let (out, _) = run(command.args(["--json", "-o"]).arg(&path), 0);
+        let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+        let names = object["curves"].as_array().unwrap().iter().map(|name| name.as_str().unwrap().to_owned());
+        let mut names: Vec<_> = names.collect();
+        // They are in the order of their panes.
+        names.sort();
+        names
+    };
+    let drawn =
+        curves(cantap().arg("plot").arg(boat()).args(["-s", "nmea2000.depth", "-s", "nmea2000.temperature"]));
+    assert_eq!(drawn, ["nmea2000.depth", "nmea2000.temperature"]);
+    // Each ship has its own.
+    let ships = curves(cantap().arg("plot").arg(boat()).args(["-s", "nmea2000.cog"]));
+    assert!(ships.iter().any(|name| name.ends_with("user_id 237808200)")) && ships.len() > 10, "{ships:?}");
+    // Two engines and two gearboxes are not one curve; what is not available has none.
+    let log = folder.path().join("engines.log");
+    let lines = (0..20).map(|n| {
+        format!(
+            "(1.{n:02}0000) can0 0CF00400#017DA068{n:02X}FFF0FF\n(1.{n:02}1000) can0 0CF00401#017DA068{:02X}FFF0FF\n\
+             (1.{n:02}2000) can0 7DF#02010C\n(1.{n:02}3000) can0 7E8#04410C1A{n:02X}\n",
+            n + 1
+        )
+    });
+    std::fs::write(&log, lines.collect::<String>()).unwrap();
+    let drawn =
+        curves(cantap().arg("plot").arg(&log).args(["-s", "j1939.engine_*", "-s", "obd.engine_speed"]));
+    assert_eq!(
+        drawn,
+        [
+            "j1939.engine_speed (0 > all)",
+            "j1939.engine_speed (1 > all)",
+            "j1939.engine_starter_mode (0 > all)",
+            "j1939.engine_starter_mode (1 > all)",
+            "j1939.engine_torque_mode (0 > all)",
+            "j1939.engine_torque_mode (1 > all)",
+            "obd.engine_speed"
+        ]
+    );
+    let reason = failure(cantap().arg("plot").arg(&log).args(["-s", "obd.speed", "-o"]).arg(&path));
+    assert!(
+        reason.contains("nothing had a number obd.speed") && reason.contains("`cantap conversations`"),
+        "{reason}"
+    );
+}
+
 #[test]
 fn without_a_file_the_picture_is_in_the_terminal() {
     let text = stdout(cantap().arg("plot").arg(boat()).args(["--timing", "09F80202", "--width", "60"]));

@@ -32,6 +32,55 @@ const WORKSHOP: &str = "\
 (4.000000) can0 7E0#023E00AAAAAAAAAA
 ";
 
+/// A sprayer at a terminal and a task controller: it was bytes, with PGNs for names.
+#[test]
+fn what_agricultural_machines_say_has_names_and_values() {
+    let log: String = (1..=9)
+        .map(|second| {
+            format!(
+                "({second}.000000) can0 0CF00400#017DA06813FFF0FF\n({second}.100000) can0 0CFE4800#B80B40420F00FFD5\n\
+                 ({second}.200000) can0 14E72680#A8D204FF3930000{second}\n({second}.210000) can0 14E68026#A8D204003930000{second}\n\
+                 ({second}.300000) can0 0CCBF780#33004800B004000{second}\n"
+            )
+        })
+        .collect();
+    let (code, out, err) = cantap("tractor", &log, &[]);
+    assert!(code == Some(0) && err.contains("channel 1 speaks j1939\n"), "{err}");
+    for line in [
+        "0 > all wheel-based speed and distance: pgn 65096, priority 3, wheel_based_machine_speed 3 m/s,",
+        "128 > 38 ECU to VT: change numeric value: pgn 59136, priority 5, function 0xA8 (change numeric value), object 1234, value 16789561",
+        "38 > 128 VT to ECU: change numeric value: pgn 58880, priority 5, function 0xA8 (change numeric value), object 1234, errors 0x00 (none),",
+        "128 > 247 process data: value: pgn 51968, priority 3, command 3 (value), element 3, ddi 72 (Actual Volume Content), \
+         actual_volume_content 16778416 ml",
+    ] {
+        assert!(out.contains(line), "{line} in {out}");
+    }
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("conversations").join("tractor");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let view = ["monitor", "bus.log", "--once", "--view", "nodes", "--size", "160x50"];
+    let shown =
+        String::from_utf8(command.args(view).current_dir(&directory).output().unwrap().stdout).unwrap();
+    assert!(shown.contains("ECU to VT: change numeric value"), "{shown}");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let plot = [
+        "plot",
+        "bus.log",
+        "-s",
+        "j1939.actual_volume_content",
+        "-s",
+        "j1939.wheel_based_*",
+        "--json",
+        "-o",
+        "a.svg",
+    ];
+    let drawn =
+        String::from_utf8(command.args(plot).current_dir(&directory).output().unwrap().stdout).unwrap();
+    assert!(
+        drawn.contains(r#"["j1939.actual_volume_content","j1939.wheel_based_direction","j1939.wheel_based_machine_distance","j1939.wheel_based_machine_speed"]"#),
+        "{drawn}"
+    );
+}
+
 #[test]
 fn frames_are_shown_as_what_they_say() {
     let (code, out, err) = cantap("conversations_text", WORKSHOP, &[]);
@@ -197,7 +246,7 @@ fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
     );
     assert!(err.contains("drive.eds: line 11: neither a section nor a key: rubbish"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "bus.log"]);
-    assert!(code == Some(1) && err.contains("is not an EDS or DCF"), "{err}");
+    assert!(code == Some(1) && err.contains("is not an EDS, DCF, XDD or XDC"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "200:drive.eds"]);
     assert!(code == Some(2) && err.contains("nodes from 1 to 127"), "{err}");
 }
@@ -289,6 +338,12 @@ fn dronecan_and_cyphal_are_read_with_their_types_and_a_users_own() {
         ),
         "{out}"
     );
+    // The live view takes the same, and shows them.
+    let view = ["monitor", "bus.log", "--once", "--view", "nodes", "--size", "160x50"];
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let shown = command.args(view).args(named).current_dir(&directory).output().unwrap();
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    assert!(shown.contains("gear_pct 42 %") && shown.contains("volt 12.5 V"), "{shown}");
     for (arguments, code, what) in [
         (["--subject", "1366=own.Nothing.1.0"], 1, "is called 'own.Nothing.1.0'"),
         (["--subject", "9000=uavcan.si.unit.voltage.Scalar.1.0"], 2, "subjects from 0 to 8191"),

@@ -179,6 +179,9 @@ fn what_can_move_needs_a_yes_and_what_does_not_fit_is_refused_before_anything_is
         ("5 position 1 --yes --eds 5:drive.eds", "the node's sheet has no object 607A"),
         ("5 mode turbo", "modes are pp, vl, pv"),
         ("128 status", "nodes are 1 to 127"),
+        ("5 status --axis 9", "9 is not in 1..=8"),
+        ("5 velocity 1 --yes --guard 0s", "--guard"),
+        ("5 velocity 1 --yes --guard-node 3", "--guard"),
     ] {
         let (code, out, err) = rig.run(line);
         assert!(code == Some(2) && out.is_empty() && err.contains(expected), "{line}: {code:?} {err}");
@@ -204,6 +207,53 @@ fn ctrl_c_stops_the_drive_and_says_so() {
     assert_eq!(code, Some(130), "{err}");
     assert!(err.contains("Ctrl-C") && err.ends_with("it was stopped, and is switch on disabled\n"), "{err}");
     assert!(rig.well("5 status").0.contains("switch on disabled"));
+}
+
+/// Whatever ends the command, even what leaves it no time: the drive hears nothing more, and stops.
+#[test]
+fn a_guarded_drive_stops_when_it_hears_nothing_more() {
+    let rig = Rig::new("node:drive?heartbeat=0");
+    let (_, err) = rig.well("5 velocity 500 -t 200ms --yes --guard 20s");
+    let (first, last) = err.split_once('\n').unwrap();
+    assert!(
+        first.starts_with("cantap: node 5 watches the heartbeat of node 127, which is sent from here: after 20000 ms without it, ")
+            && first.ends_with(
+                "(what it then does is 1 (fault), by object 6007); object 1016:01 was 00000000 and is 007F4E20 until the end"
+            ),
+        "{err}"
+    );
+    assert!(
+        last.ends_with("it was stopped, and is switch on disabled; object 1016:01 is 00000000 again\n"),
+        "{err}"
+    );
+    let (code, _, err) = rig.run("5 velocity 500 --yes --guard 1s --guard-node 5");
+    assert!(code == Some(1) && err.contains("node 5 is there; give --guard-node"), "{err}");
+    let mut running = rig.start("5 velocity 800 --yes --guard 3s");
+    until_enabled(&mut running);
+    running.kill().unwrap();
+    running.wait().unwrap();
+    let mut status = String::new();
+    for _ in 0..1000 {
+        status = rig.well("5 status").0;
+        if status.contains(": fault, ") {
+            break;
+        }
+    }
+    assert!(status.contains(": fault, ") && status.contains("error 8130"), "{status}");
+    assert!(status.contains("velocity 0"), "{status}");
+    assert!(!rig.frames("77F#05").is_empty());
+}
+
+/// It braked from a velocity and said "target reached" all the while.
+#[test]
+fn a_drive_that_still_turns_after_a_quick_stop_has_not_reached_its_target() {
+    let rig = Rig::new("node:drive?heartbeat=0");
+    rig.well("5 velocity 20000 -t 3s --yes --stay-enabled");
+    // It was told to stand, and brakes; the quick stop finds it turning, or standing.
+    let (out, _) = rig.well("5 quick-stop");
+    let status = out.lines().last().unwrap();
+    let velocity = status.rsplit("velocity ").next().unwrap().parse::<i32>().unwrap();
+    assert!(status.contains("target reached") == (velocity == 0), "{status}");
 }
 
 #[test]

@@ -89,6 +89,26 @@ fn trace_and_databases_are_in_the_page_byte_for_byte_and_no_text_becomes_markup(
     assert_eq!(report["thinned"], serde_json::json!([]));
 }
 
+/// Descriptions of conversations go with the databases, under the names by which the page's engine knows them.
+#[test]
+fn descriptions_are_in_the_page() {
+    let directory = directory("described");
+    std::fs::write(directory.join("a.log"), log(50, 10)).unwrap();
+    std::fs::create_dir_all(directory.join("types/own")).unwrap();
+    std::fs::write(directory.join("types/own/20991.Gear.uavcan"), "uint8 gear_pct\n").unwrap();
+    let ecu = cantap_virtual::ecu::DESCRIPTION;
+    std::fs::write(directory.join("ecu.a2l"), ecu).unwrap();
+    let (code, text) = cantap(&directory, &["report", "a.log", "--a2l", "ecu.a2l", "--dsdl", "types"]);
+    assert_eq!(code, Some(0), "{text}");
+    let (report, _) = report(&directory.join("a.html"));
+    let databases = report["databases"].as_array().unwrap();
+    let names: Vec<_> = databases.iter().map(|file| file["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["ecu.a2l", "own/20991.Gear.uavcan"]);
+    assert_eq!(content(&databases[0]), ecu.as_bytes());
+    let (code, text) = cantap(&directory, &["report", "a.log", "--a2l", "a.log"]);
+    assert!(code == Some(1) && text.contains("a.log"), "{text}");
+}
+
 #[test]
 fn what_has_changed_against_another_trace_is_a_finding() {
     let directory = directory("against");

@@ -54,7 +54,7 @@ fn what_the_ecu_refuses_is_an_error_that_says_why() {
         ("write IdleSpeed 850", "if that is meant, add --yes"),
         ("write IdleSpeed 9000 --yes", "it has to be from 500 to 1500"),
         ("write EngineSpeed 900 --yes", "EngineSpeed is not to be written"),
-        ("--protocol ccp daq EngineSpeed", "lists are started by XCP only"),
+        ("--protocol ccp --unlock stim --key-command x read Gear", "CCP has no stimulation"),
     ] {
         let (code, _, err) = cantap(&directory, &format!("xcp {ECU} {line}"));
         assert!(code == Some(2) && err.contains(expected), "{line}: {err}");
@@ -99,6 +99,24 @@ fn a_list_is_sent_by_the_ecu_itself_as_long_as_it_is_wanted() {
     let (code, out, err) = cantap(&directory, &format!("xcp {ECU} poll EngineSpeed Gear --every 20ms -n 3"));
     assert_eq!(code, Some(0), "{err}");
     assert!(out.starts_with("time_s") && out.lines().count() == 4, "{out}");
+}
+
+/// It had to be polled: lists were started by XCP only.
+#[test]
+fn a_list_of_ccp_is_sent_by_the_ecu_itself() {
+    let directory = directory("ccp_daq");
+    let line = format!("xcp {ECU} --protocol ccp daq EngineSpeed Uptime Gear Torque --event 0 -n 20 --csv");
+    let (code, out, err) = cantap(&directory, &line);
+    assert_eq!(code, Some(0), "{err}");
+    let mut lines = out.lines();
+    assert_eq!(lines.next(), Some("time_s,EngineSpeed,Uptime,Gear,Torque"));
+    let uptimes: Vec<f64> = lines.map(|line| line.split(',').nth(2).unwrap().parse().unwrap()).collect();
+    assert_eq!(uptimes.len(), 20);
+    // Its own clock goes on by its event's period.
+    assert!(uptimes.windows(2).all(|two| two[1] > two[0] && (two[1] - two[0]) % 10.0 == 0.0), "{out}");
+    let many = "30000000:4 ".repeat(6);
+    let (code, _, err) = cantap(&directory, &format!("xcp {ECU} --protocol ccp daq {}", many.trim_end()));
+    assert!(code == Some(1) && err.contains("have up to 3 packets, and 6 are needed"), "{err}");
 }
 
 /// A session as a listener on the bus has it, whatever the master: connected, a list set up, measured, stopped.
@@ -149,6 +167,12 @@ fn a_trace_of_it_is_found_named_and_searched() {
     );
     let (_, out, err) = cantap(&directory, "search bench.log xcp.EngineSpeed>3000 --a2l ecu.a2l --count");
     assert_eq!(out.trim(), "7", "{err}");
+    let (_, out, err) =
+        cantap(&directory, "monitor bench.log --a2l ecu.a2l --once --view nodes --size 120x30");
+    assert!(out.contains("EngineSpeed 3700 rpm"), "{out}{err}");
+    let (_, out, err) =
+        cantap(&directory, "plot bench.log --signal xcp.EngineSpeed --a2l ecu.a2l --json -o speed.svg");
+    assert!(out.contains(r#""curves":["xcp.enginespeed"]"#), "{out}{err}");
     let (_, out, err) = cantap(&directory, "decode bench.log --protocols --a2l ecu.a2l --csv");
     assert!(out.lines().filter(|line| line.contains("enginespeed")).count() == 30, "{out} {err}");
     let (_, out, _) = cantap(&directory, "conversations bench.log --quiet");
@@ -191,6 +215,61 @@ mod shared {
         served.server.wait().unwrap();
         rest.join().unwrap();
         fs::read_to_string(served.folder.path().join("heard.log")).unwrap()
+    }
+
+    /// An ECU that gives nothing without a key.
+    const LOCKED: &str = r#"
+        let ecu = #{ open: false };
+        on_frame("700", |f| {
+            let d = f.data;
+            let answer = if d[0] == 0x1B { [0, d[1], 2, 1] }
+                else if d[0] == 0x12 { [0, d[1], if d[2] == 0x40 { 1 } else { 0 }, 0x11, 0x22, 0x33, 0x44] }
+                else if d[0] == 0x13 {
+                    ecu.open = d[2] == 0xEE && d[3] == 0xDD && d[4] == 0xCC && d[5] == 0xBB;
+                    [if ecu.open { 0 } else { 0x35 }, d[1], 0x40]
+                } else if d[0] == 0x0F && !ecu.open { [0x35, d[1]] }
+                else { [0, d[1], 0x2A, 0x07] };
+            send(frame(0x701, [0xFF] + answer));
+        });
+    "#;
+
+    /// Keys were sent by XCP only.
+    #[test]
+    fn a_key_is_sent_by_ccp() {
+        let served = Served::start("virtual:load=0", Stdio::null());
+        fs::write(served.folder.path().join("ecu.rhai"), LOCKED).unwrap();
+        let mut node = served.run_node("ecu.rhai", &[]);
+        let ask = |more: &[&str]| {
+            let mut command = Command::new(CANTAP);
+            command.args([
+                "xcp",
+                "-d",
+                &served.at,
+                "-b",
+                "500k",
+                "--pair",
+                "700:701",
+                "--protocol",
+                "ccp",
+                "--order",
+                "little",
+            ]);
+            command.args(["--timeout", "20s", "--patience", "60s"]);
+            let output = command.args(more).args(["read", "20000000:2"]).output().unwrap();
+            (
+                output.status.code(),
+                String::from_utf8(output.stdout).unwrap(),
+                String::from_utf8(output.stderr).unwrap(),
+            )
+        };
+        let (code, _, err) = ask(&[]);
+        assert!(code == Some(1) && err.contains("the ECU wants a key: unlock it with --unlock"), "{err}");
+        let (code, _, err) = ask(&["--unlock", "programming", "--key-command", "printf 00000000"]);
+        assert!(code == Some(1) && err.contains("UNLOCK"), "{err}");
+        let (code, out, err) = ask(&["--unlock", "programming", "--key-command", "printf EEDDCCBB"]);
+        assert_eq!((code, out.as_str()), (Some(0), "20000000 2A 07\n"), "{err}");
+        node.kill().unwrap();
+        node.wait().unwrap();
     }
 
     /// An ECU whose master vanishes would go on sending.

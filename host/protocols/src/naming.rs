@@ -54,6 +54,40 @@ pub fn parts(name: &str) -> Option<(Protocol, String)> {
     Some((protocol.parse().ok()?, field)).filter(|(_, field)| !field.is_empty())
 }
 
+/// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
+fn is_again(known: &str, name: &str) -> bool {
+    known.strip_prefix(name).is_some_and(|rest| {
+        rest.is_empty() || rest.strip_prefix('_').is_some_and(|rest| rest.parse::<usize>().is_ok())
+    })
+}
+
+/// Fields with their names in plain form, each once: the second of a name is `NAME_2`.
+pub fn fields(event: &Event) -> Vec<(String, &Field)> {
+    let mut fields: Vec<(String, &Field)> = Vec::with_capacity(event.fields.len());
+    for field in &event.fields {
+        let name = plain(&field.name);
+        let before = fields.iter().filter(|(known, _)| is_again(known, &name)).count();
+        let name = if before == 0 { name } else { format!("{name}_{}", before + 1) };
+        fields.push((name, field));
+    }
+    fields
+}
+
+/// Whether a field, by its name in plain form, says which of several things an event is about: a data identifier, an object, an instance.
+pub fn is_key(name: &str) -> bool {
+    const KEYS: [&str; 11] =
+        ["did", "ddi", "lid", "rid", "index", "sub", "class", "attribute", "instance", "element", "object"];
+    KEYS.contains(&name)
+        || (["_instance", "_index", "_id"].iter().any(|end| name.ends_with(end))
+            && !["sequence_id", "message_id"].contains(&name))
+}
+
+/// The same of a pattern, whose field may have `*`, `?` and `[a-z]`.
+pub(crate) fn parts_of_pattern(pattern: &str) -> Option<(Protocol, String)> {
+    let (protocol, field) = pattern.split_once('.')?;
+    Some((protocol.parse().ok()?, field.to_lowercase())).filter(|(_, field)| !field.is_empty())
+}
+
 /// A value for a name.
 enum Named<'a> {
     Field(&'a Field),

@@ -1,5 +1,7 @@
 //! A master of XCP or CCP: reads, writes and measures an ECU's values over a device.
 
+mod lists;
+
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail, ensure};
@@ -10,10 +12,13 @@ use cantap_protocols::calibration::{ByteOrder, MasterSlave};
 use cantap_protocols::ccp::codec as ccp;
 use cantap_protocols::xcp::codec::{self as xcp, command};
 
+pub use self::lists::{RunningList, Sampled};
 use crate::speaking::Speaking;
 
 /// Bytes of a frame: commands are sent in classical ones, whatever the slave has room for.
 const MOST_FRAME: usize = 8;
+/// Bytes of a seed of CCP.
+const CCP_SEED: usize = 4;
 /// Most bytes that are read with one name or address.
 pub const MOST_READ: u32 = 1 << 16;
 
@@ -38,26 +43,6 @@ struct Connected {
     order: ByteOrder,
     max_cto: usize,
     max_dto: usize,
-}
-
-/// Something to measure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Sampled {
-    /// The address extension.
-    pub extension: u8,
-    /// The address.
-    pub address: u32,
-    /// Bytes.
-    pub size: usize,
-}
-
-/// A list that runs.
-#[derive(Clone, Debug)]
-pub struct RunningList {
-    /// Its number.
-    pub daq: u16,
-    /// What each of its packets contains, by the place among what was to be measured.
-    pub packets: Vec<Vec<usize>>,
 }
 
 /// A master that talks to one slave. Whatever ends it, the slave is disconnected, so that nothing goes on.
@@ -85,7 +70,7 @@ fn refusal(is_ccp: bool, code: u8) -> String {
         let text = ccp::return_name(code).unwrap_or("unknown code");
         let advice = match code {
             0x32 | 0x33 => "; the ECU has nothing there, or not for reading or writing",
-            0x35 => "; the ECU wants a key, which is not sent by CCP here",
+            0x35 => "; the ECU wants a key: unlock it with --unlock and --key-command",
             _ => "",
         };
         return format!("{text} ({code:02X}){advice}");
@@ -126,7 +111,8 @@ impl<'d> Master<'d> {
         events.filter(|event| is_ours(event, parties)).collect()
     }
 
-    const fn is_ccp(&self) -> bool {
+    /// Whether it speaks CCP, whose packets have no stamps.
+    pub const fn is_ccp(&self) -> bool {
         self.options.ccp.is_some()
     }
 
@@ -243,7 +229,7 @@ impl<'d> Master<'d> {
     /// It stops answering.
     pub fn inquire(&mut self) -> anyhow::Result<()> {
         if self.is_ccp() {
-            for command in [vec![ccp::command::EXCHANGE_ID], vec![0x0D]] {
+            for command in [vec![ccp::command::EXCHANGE_ID], vec![ccp::command::GET_S_STATUS]] {
                 let answer = self.ask_whether(command, 0, true)?;
                 // The name follows, as long as it was said to be.
                 if let Ok([length, 1, ..]) = answer.as_deref() {
@@ -341,7 +327,17 @@ impl<'d> Master<'d> {
     ///
     /// The slave does not answer or refuses.
     pub fn seed(&mut self, resource: u8) -> anyhow::Result<Vec<u8>> {
-        ensure!(!self.is_ccp(), "keys are sent by XCP only");
+        if self.is_ccp() {
+            let answer = self.ask(vec![ccp::command::GET_SEED, resource], 1, true)?;
+            let Some((&is_protected, seed)) = answer.split_first() else {
+                bail!("the ECU's answer has no seed")
+            };
+            return Ok(if is_protected == 0 {
+                Vec::new()
+            } else {
+                seed.iter().copied().take(CCP_SEED).collect()
+            });
+        }
         let (mut part, mut seed, mut left) = (0, Vec::new(), None);
         loop {
             let answer = self.ask(vec![command::GET_SEED, part, resource], 0, false)?;
@@ -366,6 +362,10 @@ impl<'d> Master<'d> {
     ///
     /// The slave refuses it; it has then ended the session.
     pub fn unlock(&mut self, key: &[u8]) -> anyhow::Result<()> {
+        if self.is_ccp() {
+            ensure!((1..=6).contains(&key.len()), "a key of CCP has 1 to 6 bytes");
+            return self.ask([&[ccp::command::UNLOCK][..], key].concat(), 0, false).map(drop);
+        }
         ensure!((1..=255).contains(&key.len()), "a key has 1 to 255 bytes");
         let mut left = key;
         while !left.is_empty() {
@@ -374,60 +374,6 @@ impl<'d> Master<'d> {
             left = &left[part.len()..];
         }
         Ok(())
-    }
-
-    /// Sets up a list of these values and starts it.
-    ///
-    /// # Errors
-    ///
-    /// The slave does not answer or refuses, has no dynamic lists, or a value is longer than a packet.
-    pub fn start_list(&mut self, values: &[Sampled], event: u16) -> anyhow::Result<RunningList> {
-        ensure!(!self.is_ccp(), "lists are started by XCP only; use poll for CCP");
-        let state = self.state()?;
-        let info = self.ask(vec![command::GET_DAQ_PROCESSOR_INFO], 0, true)?;
-        let &[properties, _, _, first, second, predefined, key, ..] = &info[..] else {
-            bail!("the ECU's answer about its lists has {} bytes; it has to have 7", info.len());
-        };
-        ensure!(properties & 1 != 0, "the ECU has only lists that are ready (static); use poll");
-        ensure!(key >> 6 == 0, "the ECU identifies its packets in a way that is not supported; use poll");
-        let events = state.order.number(&[first, second]);
-        ensure!(
-            u64::from(event) < events || events == 0,
-            "the ECU has the events 0 to {}",
-            events.max(1) - 1
-        );
-        let has_stamps = properties & 0x10 != 0;
-        let (mut stamp, mut largest) = (0, state.max_dto.min(MOST_FRAME) - 1);
-        if let Ok(resolution) = self.ask_whether(vec![command::GET_DAQ_RESOLUTION_INFO], 0, true)? {
-            largest = resolution.get(1).map_or(largest, |size| usize::from(*size).min(largest)).max(1);
-            let mode = resolution.get(4).copied().unwrap_or_default();
-            stamp = if has_stamps { usize::from(mode & 7) } else { 0 };
-        }
-        let packets = packets(values, stamp, state.max_dto.min(MOST_FRAME) - 1, largest)?;
-        let daq = u16::from(predefined);
-        let list = self.number(daq.into(), 2);
-        self.ask(vec![command::FREE_DAQ], 0, true)?;
-        self.ask([&[command::ALLOC_DAQ, 0][..], &self.number(1, 2)].concat(), 0, false)?;
-        let count = u8::try_from(packets.len()).context("more than 255 packets")?;
-        self.ask([&[command::ALLOC_ODT, 0][..], &list, &[count]].concat(), 0, false)?;
-        for (odt, entries) in packets.iter().enumerate() {
-            let numbers = [odt as u8, entries.len() as u8];
-            self.ask([&[command::ALLOC_ODT_ENTRY, 0][..], &list, &numbers].concat(), 0, false)?;
-        }
-        for (odt, entries) in packets.iter().enumerate() {
-            self.ask([&[command::SET_DAQ_PTR, 0][..], &list, &[odt as u8, 0]].concat(), 0, true)?;
-            for Sampled { extension, address, size } in entries.iter().map(|place| values[*place]) {
-                let address = self.number(address.into(), 4);
-                let command = [&[command::WRITE_DAQ, 0xFF, size as u8, extension][..], &address].concat();
-                self.ask(command, 0, false)?;
-            }
-        }
-        let mode = if stamp > 0 { 0x10 } else { 0 };
-        let event = self.number(event.into(), 2);
-        self.ask([&[command::SET_DAQ_LIST_MODE, mode][..], &list, &event, &[1, 0]].concat(), 0, true)?;
-        self.ask([&[command::START_STOP_DAQ_LIST, 2][..], &list].concat(), 0, true)?;
-        self.ask(vec![command::START_STOP_SYNCH, 1], 0, true)?;
-        Ok(RunningList { daq, packets })
     }
 
     /// Ends the session: lists are stopped, the slave is disconnected. Also after Ctrl-C, and without waiting for answers.
@@ -470,46 +416,4 @@ impl Drop for Master<'_> {
 fn is_ours(event: &Event, parties: MasterSlave) -> bool {
     let (master, slave) = (parties.master.into(), parties.slave.into());
     (event.from, event.to) == (master, slave) || (event.from, event.to) == (slave, master)
-}
-
-/// Puts values into as few packets as they fit in, in their order.
-fn packets(values: &[Sampled], stamp: usize, room: usize, largest: usize) -> anyhow::Result<Vec<Vec<usize>>> {
-    let (mut packets, mut left) = (vec![Vec::new()], room.saturating_sub(stamp));
-    for (place, value) in values.iter().enumerate() {
-        ensure!(
-            value.size <= room.min(largest),
-            "{:08X} has {} bytes, of which a packet has room for {}; read or poll it",
-            value.address,
-            value.size,
-            room.min(largest)
-        );
-        if value.size > left {
-            packets.push(Vec::new());
-            left = room;
-        }
-        left -= value.size;
-        if let Some(packet) = packets.last_mut() {
-            packet.push(place);
-        }
-    }
-    // A stamp alone would be a packet that nothing is in.
-    ensure!(!packets[0].is_empty(), "its first value has no room beside the stamp; name a shorter one first");
-    Ok(packets)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn sizes(sizes: &[usize]) -> Vec<Sampled> {
-        sizes.iter().map(|size| Sampled { extension: 0, address: 0, size: *size }).collect()
-    }
-
-    #[test]
-    fn values_are_packed_in_their_order() {
-        let packed = packets(&sizes(&[2, 1, 4, 2, 1]), 4, 7, 7).unwrap();
-        assert_eq!(packed, [vec![0, 1], vec![2, 3, 4]]);
-        assert!(packets(&sizes(&[8]), 0, 7, 7).is_err(), "longer than a packet");
-        assert!(packets(&sizes(&[4]), 4, 7, 7).is_err(), "the stamp is there");
-    }
 }

@@ -1,15 +1,20 @@
 //! A drive (CiA 402) in motion: what it is told, and the state in which it is left, whatever happens.
 
+mod guard;
+
 use std::fmt;
 use std::io;
 use std::time::Duration;
 
 use anyhow::{anyhow, bail};
 use cantap_protocols::active::drive::{DriveClient, DriveError, DriveStep, DriveTiming, DriveValues};
+use cantap_protocols::active::heartbeat::HeartbeatProducer;
 use cantap_protocols::active::sdo::SdoError;
 use cantap_protocols::canopen::drive::{DriveState, error, mode_name, status_flags};
 use cantap_protocols::{Event, EventKind};
 
+pub use self::guard::Guard;
+use self::guard::{Guarded, run};
 use crate::advice::sentence;
 use crate::interrupt;
 use crate::speaking::Speaking;
@@ -65,6 +70,8 @@ const TARGET_TIME: Duration = Duration::from_mins(1);
 pub struct DriveStatus {
     /// Its node number.
     pub node: u8,
+    /// Which axis of the node it is, from 1.
+    pub axis: u8,
     /// When the last of it was read: the stamp, in nanoseconds, as in records.
     pub time_ns: i64,
     /// The states that it has confirmed, one after the other, since the last status.
@@ -74,6 +81,14 @@ pub struct DriveStatus {
 }
 
 impl DriveStatus {
+    /// `node 5`; of a further axis, `node 5 axis 2`.
+    pub fn name(&self) -> String {
+        match self.axis {
+            0 | 1 => format!("node {}", self.node),
+            axis => format!("node {} axis {axis}", self.node),
+        }
+    }
+
     /// The bits of its statusword that are no state, with commas.
     pub fn flags(&self) -> String {
         self.values.statusword.map(|word| status_flags(word, self.values.mode)).unwrap_or_default()
@@ -93,7 +108,7 @@ impl DriveStatus {
 impl fmt::Display for DriveStatus {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let DriveValues { statusword, error_code, position, velocity, torque, .. } = self.values;
-        write!(f, "node {}", self.node)?;
+        write!(f, "{}", self.name())?;
         if let Some(word) = statusword {
             let state = DriveState::of(word).map_or("in no state", DriveState::name);
             write!(f, ": {state}, statusword {word:04X}")?;
@@ -127,24 +142,41 @@ pub struct Drive<'s, 'd> {
     speaking: &'s mut Speaking<'d>,
     client: DriveClient,
     node: u8,
+    axis: u8,
     /// The stamp of the last answer.
     time_ns: i64,
     states: Vec<DriveState>,
     /// It was told something, so that it may have to be stopped.
     is_commanded: bool,
+    answer_ns: u64,
+    /// Our heartbeat, while it is watched.
+    heartbeat: Option<HeartbeatProducer>,
+    guarded: Option<Guarded>,
     on_status: OnStatus<'s>,
 }
 
 impl<'s, 'd> Drive<'s, 'd> {
-    /// For the node with this number, 1 to 127.
+    /// For this axis, from 1, of the node with this number, 1 to 127.
     pub fn new(
         speaking: &'s mut Speaking<'d>,
         node: u8,
+        axis: u8,
         timing: DriveTiming,
         on_status: OnStatus<'s>,
     ) -> Self {
-        let client = DriveClient::new(node, timing);
-        Self { speaking, client, node, time_ns: 0, states: Vec::new(), is_commanded: false, on_status }
+        Self {
+            speaking,
+            client: DriveClient::new(node, timing).with_axis(axis),
+            node,
+            axis,
+            time_ns: 0,
+            states: Vec::new(),
+            is_commanded: false,
+            answer_ns: timing.answer_ns,
+            heartbeat: None,
+            guarded: None,
+            on_status,
+        }
     }
 
     /// The last confirmed state.
@@ -159,7 +191,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     pub fn step(&mut self, step: DriveStep) -> anyhow::Result<()> {
         self.is_commanded |= step != DriveStep::Inspect;
         self.client.begin(step);
-        let ran = self.speaking.run(&mut self.client);
+        let ran = run(self.speaking, self.heartbeat.as_mut(), &mut self.client, false);
         self.take_events()?;
         ran?;
         self.client.outcome().map_err(|error| self.explained(error))
@@ -224,6 +256,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     fn pass_on(&mut self) -> anyhow::Result<()> {
         let status = DriveStatus {
             node: self.node,
+            axis: self.axis,
             time_ns: self.time_ns,
             states: std::mem::take(&mut self.states),
             values: *self.client.values(),
@@ -286,15 +319,16 @@ impl<'s, 'd> Drive<'s, 'd> {
             Err(_) if !self.is_commanded => Ok("it was told nothing".to_owned()),
             _ => self.stop(),
         };
+        let guard = self.unguard().map_or_else(String::new, |text| format!("; {text}"));
         interrupt::before_the_end(None);
         // Of a drive that has not answered, nothing is known.
         let told = if self.client.values().statusword.is_some() { self.pass_on() } else { Ok(()) };
         let node = self.node;
         match (done, left) {
-            (Ok(done), Ok(left)) => told.map(|()| format!("node {node}: {done}; {left}")),
-            (Ok(done), Err(stop)) => Err(anyhow!("node {node}: {done}; {stop}")),
-            (Err(error), Ok(left)) => Err(anyhow!("{}; {left}", sentence(&error))),
-            (Err(error), Err(stop)) => Err(anyhow!("{}; {stop}", sentence(&error))),
+            (Ok(done), Ok(left)) => told.map(|()| format!("node {node}: {done}; {left}{guard}")),
+            (Ok(done), Err(stop)) => Err(anyhow!("node {node}: {done}; {stop}{guard}")),
+            (Err(error), Ok(left)) => Err(anyhow!("{}; {left}{guard}", sentence(&error))),
+            (Err(error), Err(stop)) => Err(anyhow!("{}; {stop}{guard}", sentence(&error))),
         }
     }
 
@@ -378,7 +412,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     /// As [`Self::step`], after Ctrl-C as well.
     fn last_step(&mut self, step: DriveStep) -> anyhow::Result<()> {
         self.client.begin(step);
-        let ran = self.speaking.run_last(&mut self.client);
+        let ran = run(self.speaking, self.heartbeat.as_mut(), &mut self.client, true);
         // Whoever reads what is printed may be gone.
         let _ = self.take_events();
         ran?;

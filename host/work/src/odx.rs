@@ -21,6 +21,18 @@ pub struct OdxPath {
     layer: Option<String>,
 }
 
+impl OdxPath {
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The layer that was chosen in it.
+    pub fn layer(&self) -> Option<&str> {
+        self.layer.as_deref()
+    }
+}
+
 impl FromStr for OdxPath {
     type Err = String;
 

@@ -102,7 +102,7 @@ impl App {
             None => text.split_once(" if ").map_or((text, None), |(text, condition)| (text, Some(condition))),
         };
         let only_while = condition.map(|text| {
-            let parsed = cantap_protocols::condition(text, decoder, &cantap_protocols::Options::default());
+            let parsed = cantap_protocols::condition(text, decoder, model.conversations());
             parsed.map(|condition| While::new(text.trim().to_owned(), condition))
         });
         let only_while = only_while.transpose().map_err(|error| error.to_string())?;

@@ -158,6 +158,7 @@ pub struct Model {
     /// The latest message for the user.
     pub notice: String,
     talk: Talk,
+    conversations: cantap_protocols::Options,
     options: Options,
 }
 
@@ -192,6 +193,7 @@ impl Model {
             vehicle: VehicleSeen::default(),
             notice: String::new(),
             talk: Talk::default(),
+            conversations: cantap_protocols::Options::default(),
             options,
         })
     }
@@ -199,6 +201,17 @@ impl Model {
     /// The options of the statistics.
     pub fn options(&self) -> &Options {
         &self.options
+    }
+
+    /// Reads what frames say together by these pairs and descriptions. Before the first record.
+    #[must_use]
+    pub fn with_conversations(self, conversations: cantap_protocols::Options) -> Self {
+        Self { talk: Talk::new(&conversations), conversations, ..self }
+    }
+
+    /// How what frames say together is read.
+    pub fn conversations(&self) -> &cantap_protocols::Options {
+        &self.conversations
     }
 
     /// Changes the decoding from now on, including the past.
@@ -244,7 +257,7 @@ impl Model {
         self.history.clear();
         self.seen.table = FixedTable::default();
         self.seen.signals.clear();
-        (self.talk, self.seen.talked) = (Talk::default(), Talked::default());
+        (self.talk, self.seen.talked) = (Talk::new(&self.conversations), Talked::default());
         self.scripts.output.clear();
         self.vehicle.table = Table::default();
         self.seen.taken = 0;

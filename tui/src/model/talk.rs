@@ -32,11 +32,16 @@ pub struct Talk {
 
 impl Default for Talk {
     fn default() -> Self {
-        Self { reading: Reading::new(Options::default(), None, None) }
+        Self::new(&Options::default())
     }
 }
 
 impl Talk {
+    /// By these pairs and descriptions.
+    pub fn new(options: &Options) -> Self {
+        Self { reading: Reading::new(options.clone(), None, None) }
+    }
+
     /// Takes records. The first seconds of a bus are examined before they are decoded.
     pub fn take(&mut self, records: &[TraceRecord], talked: &mut Talked) {
         let Ok(()) = self.reading.take(records, true, |event| {

@@ -1,10 +1,8 @@
 //! What frames say together: requests and answers, messages of several frames, announcements.
 
 use std::convert::Infallible;
-use std::sync::Arc;
 
 use cantap_protocols::{Event, EventKind, Options, Party, ReadItem, Reader};
-use cantap_signals::Decoder;
 use serde::Serialize;
 
 use crate::interval::{self, IntervalAnswer};
@@ -42,9 +40,9 @@ pub struct Found {
 }
 
 /// Reads the records by their protocols, and passes on each event, those of `from_ns` and later for certain.
-pub fn read(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, mut each: impl FnMut(&Event)) {
+pub fn read(content: &Content, options: Options, from_ns: i64, to_ns: i64, mut each: impl FnMut(&Event)) {
     let store = &content.store;
-    let mut reader = Reader::new(Options { decoder: Some(Arc::new(decoder.clone())), ..Options::default() });
+    let mut reader = Reader::new(options);
     let surveyed = store.row_at(content.begin_kept_ns().saturating_add(SURVEY_NS)).min(MOST_SURVEYED);
     let begin = store.row_at(from_ns.saturating_sub(LEAD_NS)).max(surveyed);
     let end = store.row_at(to_ns.saturating_add(1));
@@ -69,9 +67,9 @@ pub fn read(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, mut 
 }
 
 /// The first events that ended in a stretch of time, and how many there are.
-pub fn found(content: &Content, decoder: &Decoder, from_ns: i64, to_ns: i64, limit: usize) -> Found {
+pub fn found(content: &Content, options: Options, from_ns: i64, to_ns: i64, limit: usize) -> Found {
     let mut found = Found { events: Vec::new(), total: 0 };
-    read(content, decoder, from_ns, to_ns, |event| {
+    read(content, options, from_ns, to_ns, |event| {
         if event.time_ns < from_ns || event.start_ns > to_ns {
             return;
         }

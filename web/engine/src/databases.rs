@@ -1,7 +1,9 @@
 //! The databases: those that were opened, the user's own, and the keys by which the page names messages and signals.
 
 use std::collections::BTreeSet;
+use std::sync::Arc;
 
+use cantap_protocols::Options;
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, MessageRef, Multiplexed, Signal, Source, ValueKind,
 };
@@ -9,6 +11,7 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 use serde::Serialize;
 
+use crate::descriptions::Descriptions;
 use crate::error::EngineError;
 use crate::index::{Index, Place};
 use crate::own_database::{OwnDatabase, ValueText};
@@ -16,7 +19,7 @@ use crate::own_database::{OwnDatabase, ValueText};
 /// Bits of a key that are the signal's place in its message.
 const SIGNAL_BITS: u32 = 20;
 
-/// What was taken from a database.
+/// What was taken from a database, or from a description of what conversations are about: then `messages` are what it describes.
 #[derive(Serialize)]
 pub struct Loaded {
     messages: usize,
@@ -62,6 +65,7 @@ pub struct Databases {
     decoder: Decoder,
     entries: Vec<Entry>,
     by_place: FxHashMap<Place, usize>,
+    descriptions: Descriptions,
 }
 
 impl Default for Databases {
@@ -72,13 +76,18 @@ impl Default for Databases {
             decoder: Decoder::new(Vec::new()),
             entries: Vec::new(),
             by_place: FxHashMap::default(),
+            descriptions: Descriptions::default(),
         }
     }
 }
 
 impl Databases {
-    /// Adds a database for one channel or all; one of the same name and channel is replaced.
+    /// Adds a description, or a database for one channel or all; one of the same name and channel is replaced.
     pub fn add(&mut self, name: &str, bytes: &[u8], channel: Option<u8>) -> Result<Loaded, EngineError> {
+        if Descriptions::are_in(name) {
+            let (messages, warnings) = self.descriptions.add(name, bytes)?;
+            return Ok(Loaded { messages, signals: 0, warnings });
+        }
         let database = cantap_signals::parse(name, bytes)?;
         let loaded = Loaded::of(&database);
         self.sources.retain(|source| source.database.file != database.file || source.channel != channel);
@@ -104,6 +113,11 @@ impl Databases {
     /// The decoder of all of them.
     pub const fn decoder(&self) -> &Decoder {
         &self.decoder
+    }
+
+    /// How conversations are read.
+    pub fn conversations(&self) -> Options {
+        Options { decoder: Some(Arc::new(self.decoder.clone())), ..self.descriptions.options().clone() }
     }
 
     /// The message of an identifier.

@@ -365,9 +365,9 @@ impl Engine {
             }
             Request::Conversations { from, to, limit } => {
                 let (from, to) = window(from, to);
-                json(conversations::found(content, databases.decoder(), from, to, limit.min(MOST_ROWS)))
+                json(conversations::found(content, databases.conversations(), from, to, limit.min(MOST_ROWS)))
             }
-            Request::Findings {} => json(findings::all(content, index, databases.decoder())),
+            Request::Findings {} => json(findings::all(content, index, &*databases)),
             Request::Export { view, format, from, to } => {
                 let rows = views.rows(view, store)?;
                 json(export::export(rows, store, window(from, to), trace.name(), &format, sections)?)
@@ -458,7 +458,7 @@ impl Engine {
     /// If no trace is open.
     pub fn findings(&mut self) -> Result<Vec<Finding>, EngineError> {
         self.extend_index();
-        Ok(findings::all(self.content()?, &self.index, self.databases.decoder()))
+        Ok(findings::all(self.content()?, &self.index, &self.databases))
     }
 }
 

@@ -42,6 +42,9 @@ pub enum EngineError {
     /// A database is unusable.
     #[error(transparent)]
     Database(#[from] DatabaseError),
+    /// A description is unusable.
+    #[error("{0}")]
+    Description(String),
     /// A text is no filter and no condition.
     #[error("{0}")]
     Filter(String),

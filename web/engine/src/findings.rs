@@ -10,6 +10,7 @@ use cantap_trace::{Id, Seconds, TraceEvent};
 use serde::Serialize;
 
 use crate::conversations;
+use crate::databases::Databases;
 use crate::gaps::BUS_OFF;
 use crate::identifiers::intact_intervals;
 use crate::index::{Index, Place};
@@ -83,13 +84,13 @@ impl Finding {
 }
 
 /// All findings, the worst first.
-pub fn all(content: &Content, index: &Index, decoder: &Decoder) -> Vec<Finding> {
+pub fn all(content: &Content, index: &Index, databases: &Databases) -> Vec<Finding> {
     let mut found = Vec::new();
     losses(content, &mut found);
     unread(content, &mut found);
     channels(content, &mut found);
-    missing_periods(content, index, decoder, &mut found);
-    trouble_codes(content, decoder, &mut found);
+    missing_periods(content, index, databases.decoder(), &mut found);
+    trouble_codes(content, databases, &mut found);
     found.sort_by_key(|finding: &Finding| finding.severity);
     found
 }
@@ -261,12 +262,12 @@ pub fn name(place: Place, decoder: &Decoder) -> String {
     }
 }
 
-fn trouble_codes(content: &Content, decoder: &Decoder, found: &mut Vec<Finding>) {
+fn trouble_codes(content: &Content, databases: &Databases, found: &mut Vec<Finding>) {
     let records = content.store.len();
     let end = if records > MOST_RECORDS_READ { content.store.time_ns(MOST_RECORDS_READ) } else { i64::MAX };
     let mut known = BTreeSet::new();
     let mut listed = Vec::new();
-    conversations::read(content, decoder, i64::MIN, end.saturating_sub(1), |event| {
+    conversations::read(content, databases.conversations(), i64::MIN, end.saturating_sub(1), |event| {
         let Some(cantap_protocols::Value::Text(codes)) = event.field("codes").map(|field| &field.value)
         else {
             return;

@@ -15,6 +15,7 @@ mod board;
 mod conversations;
 mod databases;
 mod dbc_text;
+mod descriptions;
 mod device_times;
 mod engine;
 mod error;

@@ -385,6 +385,42 @@ fn random_damage_never_panics() {
     }
 }
 
+/// A node of DroneCAN says something of its maker's, and a master measures by XCP: bytes, until somebody describes them.
+#[test]
+fn conversations_are_read_by_descriptions() {
+    let lines = (1..=9).map(|second| {
+        format!(
+            "({second}.000000) can0 1001550A#0{second}0000008C0000C{second}\n({second}.100000) can0 1051FF0A#2AC{second}\n\
+             ({second}.200000) can1 7F0#FF00\n({second}.200500) can1 7F1#FF05C00808000101\n\
+             ({second}.300000) can1 7F0#F402000000000020\n({second}.300500) can1 7F1#FF800C\n"
+        )
+    });
+    let mut page = Page::default();
+    page.open("bench.log", lines.collect::<String>().as_bytes()).unwrap();
+    let texts = |page: &mut Page| {
+        let found = page.ask("conversations", json!({ "from": null, "to": null, "limit": 1000 }));
+        let texts: Vec<_> =
+            found["events"].as_array().unwrap().iter().map(|event| event["text"].to_string()).collect();
+        texts.join("\n")
+    };
+    let before = texts(&mut page);
+    assert!(before.contains("data type 20991") && !before.contains("EngineSpeed"), "{before}");
+    let loaded = page.database("own/20991.Gear.uavcan", "uint8 gear_pct\n");
+    assert_eq!((&loaded["messages"], &loaded["warnings"]), (&json!(1), &json!([])));
+    let loaded = page.database("ecu.a2l", cantap_virtual::ecu::DESCRIPTION);
+    assert!(loaded["messages"].as_u64().unwrap() > 3, "{loaded}");
+    let after = texts(&mut page);
+    assert!(after.contains("own.Gear") && after.contains("gear_pct 42"), "{after}");
+    assert!(after.contains("EngineSpeed 800 rpm"), "{after}");
+    // The databases are as they were.
+    assert_eq!(page.ask("messages", json!({})), json!([]));
+    for (name, text) in [("x.a2l", "no A2L"), ("x.eds", "nothing"), ("x.cdd", "<x/>")] {
+        let refused =
+            page.try_ask("database", json!({ "name": name, "channel": null }), Some(text.as_bytes()));
+        assert!(refused.unwrap_err().contains(name));
+    }
+}
+
 /// Chunks as a live source sends them: frames of two identifiers, 1 ms apart, from this number on.
 fn live(from: i64, count: i64) -> Vec<u8> {
     let record = |n: i64| {

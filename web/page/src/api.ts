@@ -270,7 +270,10 @@ export interface Requests {
   summary: { in: Record<string, never>; out: Summary };
   /** In bit/s; `dataBitrate` is that of data phases of CAN FD. */
   bitrate: { in: { channel: number; bitrate: number; dataBitrate?: number }; out: Summary };
-  /** Adds a database (DBC, KCD, SYM, ARXML, DBF: recognised by name and content), for one channel or all. */
+  /**
+   * Adds a database (DBC, KCD, SYM, ARXML, DBF: recognised by name and content), for one channel or all; or what describes conversations (A2L, ODX,
+   * PDX, CDD, EDS, DSDL, by name).
+   */
   database: { in: { name: string; bytes: Uint8Array; channel: number | null }; out: { messages: number; signals: number; warnings: string[] } };
   /** All messages: those of databases, and whether they occur. */
   messages: { in: Record<string, never>; out: MessageInfo[] };

@@ -10,7 +10,7 @@ use cantap_protocols::canopen::eds::number;
 use cantap_protocols::canopen::{CanOpen, Sheet, encode};
 use cantap_trace::Seconds;
 use cantap_work::drive::{
-    Drive, DriveStatus, Motion, MotionOptions, TARGET_POSITION, TARGET_TORQUE, TARGET_VELOCITY,
+    Drive, DriveStatus, Guard, Motion, MotionOptions, TARGET_POSITION, TARGET_TORQUE, TARGET_VELOCITY,
 };
 use serde_json::json;
 
@@ -34,6 +34,9 @@ pub(super) struct DriveArgs {
     /// The drive's node number, 1 to 127.
     #[arg(value_parser = super::node)]
     node: u8,
+    /// Which axis of the node, 1 to 8: the objects of each are 800h above those of the one before.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=8), global = true)]
+    axis: u8,
     /// How long a state, a mode or a set-point may take to be confirmed.
     #[arg(long, value_name = "TIME", default_value = "2s", value_parser = args::positive_duration, global = true)]
     confirm: Duration,
@@ -148,6 +151,13 @@ struct MotionArgs {
     /// the drive loses its power.
     #[arg(long)]
     stay_enabled: bool,
+    /// Have the drive end the motion by itself if it hears nothing from here for this long (500ms without a value), as when a cable is pulled: this
+    /// computer sends a heartbeat, and an entry of object 1016 says so to the drive until the end.
+    #[arg(long, value_name = "TIME", num_args = 0..=1, default_missing_value = "500ms", value_parser = args::positive_duration)]
+    guard: Option<Duration>,
+    /// The number of the node whose heartbeat that is; one that no node has.
+    #[arg(long, value_name = "NODE", default_value_t = 127, value_parser = super::node, requires = "guard")]
+    guard_node: u8,
 }
 
 fn mode(text: &str) -> Result<i8, String> {
@@ -160,18 +170,22 @@ fn mode(text: &str) -> Result<i8, String> {
 /// The objects of a node, as its sheet has them.
 struct Objects<'a> {
     node: u8,
+    /// What its objects are above those of the first axis.
+    offset: u16,
     sheet: Option<&'a Sheet>,
 }
 
 impl Objects<'_> {
     /// The bytes of a value, if it fits the object and the limits that the sheet sets.
     fn bytes(&self, index: u16, text: &str) -> anyhow::Result<Vec<u8>> {
+        let of_first = index;
+        let index = index + self.offset;
         let entry = self.sheet.map(|sheet| sheet.eds.entry_of(index, 0));
         let entry = match entry {
             Some(None) => return Err(usage(format!("the node's sheet has no object {index:04X}"))),
             entry => entry.flatten(),
         };
-        let kind = entry.and_then(|entry| entry.data_type).or_else(|| data_type(index));
+        let kind = entry.and_then(|entry| entry.data_type).or_else(|| data_type(of_first));
         let kind = kind.ok_or_else(|| anyhow!("the type of {index:04X} is not known"))?;
         let data = encode(kind, text).map_err(|error| usage(format!("object {index:04X}: {error}")))?;
         let Some(entry) = entry else { return Ok(data) };
@@ -209,7 +223,24 @@ enum Job {
     Move(Motion, MotionOptions),
 }
 
+impl MotionArgs {
+    fn guard(&self) -> Option<Guard> {
+        self.guard.map(|within| Guard { node: self.guard_node, within })
+    }
+}
+
 impl What {
+    /// What the drive is to watch meanwhile.
+    fn guard(&self) -> Option<Guard> {
+        match self {
+            Self::Velocity { motion, .. }
+            | Self::Position { motion, .. }
+            | Self::Home { motion, .. }
+            | Self::Torque { motion, .. } => motion.guard(),
+            _ => None,
+        }
+    }
+
     fn job(&self, objects: &Objects<'_>) -> anyhow::Result<Job> {
         let confirmed = |yes: &Yes| if yes.yes { Ok(()) } else { Err(usage(DANGER)) };
         let options = |motion: &MotionArgs, parameters| {
@@ -271,7 +302,7 @@ pub(super) fn run(
     let own = sheets.iter().find(|sheet| sheet.node == Some(args.node));
     let sheet = own.or_else(|| sheets.iter().find(|sheet| sheet.node.is_none()));
     // Everything is checked before anything is sent.
-    let job = args.what.job(&Objects { node: args.node, sheet })?;
+    let job = args.what.job(&Objects { node: args.node, offset: u16::from(args.axis - 1) * 0x800, sheet })?;
     let timing = DriveTiming {
         answer_ns,
         confirm_ns: args::nanoseconds(args.confirm),
@@ -288,20 +319,24 @@ pub(super) fn run(
         } else {
             // The state that it is in now is in the last line.
             for state in status.states.iter().rev().skip(1).rev() {
-                writeln!(out, "node {}: {}", status.node, state.name())?;
+                writeln!(out, "{}: {}", status.name(), state.name())?;
             }
             writeln!(out, "{status}")?;
         }
         out.flush()
     };
-    let mut drive = Drive::new(&mut speaking, args.node, timing, Box::new(on_status));
+    let mut drive = Drive::new(&mut speaking, args.node, args.axis, timing, Box::new(on_status));
     let done = match job {
         Job::Report => drive.report().map(|()| None),
         Job::Watch(period, time) => drive.watch(period, time).map(|()| None),
         Job::Enable => drive.enable().map(Some),
         Job::Step(step) => drive.single(step).map(|()| None),
         Job::Mode(mode, yes) => choose(&mut drive, mode, yes).map(|()| None),
-        Job::Move(motion, options) => drive.move_it(&motion, &options).map(Some),
+        Job::Move(motion, options) => args
+            .what
+            .guard()
+            .map_or(Ok(()), |guard| watch_us(&mut drive, guard))
+            .and_then(|()| drive.move_it(&motion, &options).map(Some)),
     };
     drop(drive);
     if let Some(text) = done? {
@@ -309,6 +344,12 @@ pub(super) fn run(
     }
     drop(speaking);
     device.stop()?;
+    Ok(())
+}
+
+fn watch_us(drive: &mut Drive<'_, '_>, guard: Guard) -> anyhow::Result<()> {
+    let text = drive.guard(guard)?;
+    stderr::tell(&format!("cantap: {text}\n"));
     Ok(())
 }
 
@@ -328,6 +369,7 @@ fn line(channel: u8, status: &DriveStatus) -> String {
     let rest = json!({
         "channel": channel,
         "node": status.node,
+        "axis": status.axis,
         "states": names,
         "state": values.state().map(DriveState::name),
         "statusword": values.statusword,

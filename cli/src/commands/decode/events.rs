@@ -8,23 +8,12 @@ use cantap_trace::Interface;
 use super::csv::Cells;
 use cantap_trace::Seconds;
 
-/// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
-fn is_again(known: &str, name: &str) -> bool {
-    known.strip_prefix(name).is_some_and(|rest| {
-        rest.is_empty() || rest.strip_prefix('_').is_some_and(|rest| rest.parse::<usize>().is_ok())
-    })
-}
-
 /// Names and values, followed by those that every event has.
 fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
-    let mut fields: Vec<(String, Value, String, Option<String>)> = Vec::new();
-    for field in &event.fields {
-        let name = naming::plain(&field.name);
-        let before = fields.iter().filter(|(known, ..)| is_again(known, &name)).count();
-        let name = if before == 0 { name } else { format!("{name}_{}", before + 1) };
-        let text = field.text.as_ref().map(ToString::to_string);
-        fields.push((name, field.value.clone(), field.unit.to_string(), text));
-    }
+    let own = naming::fields(event).into_iter().map(|(name, field)| {
+        (name, field.value.clone(), field.unit.to_string(), field.text.as_ref().map(ToString::to_string))
+    });
+    let mut fields: Vec<_> = own.collect();
     let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
     add("kind", Value::Text(event.kind.name().into()));
     if let Some(ns) = event.response_ns {

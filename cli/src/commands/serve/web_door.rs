@@ -93,7 +93,7 @@ impl WebDoor {
         }
         let options = databases.or_of(boards.addresses());
         let decoder = load(&options, false, false)?;
-        let about = page::about_devices(boards.addresses(), &options, "cantap serve")?;
+        let about = page::about_devices(boards.addresses(), &options, Vec::new(), "cantap serve")?;
         let site = Site::new(&page::with(&page::find()?, page::LIVE, &about)?)?;
         Ok(Self {
             address,

@@ -159,7 +159,7 @@ impl DaqArgs {
     pub fn run(&self, targets: &[Target], master: &mut Master<'_>, json: bool) -> anyhow::Result<()> {
         let values: Vec<_> = targets.iter().flat_map(Target::sampled).collect();
         let list = master.start_list(&values, self.event)?;
-        let mut rows = Rows::table(columns(targets), json, self.csv, true);
+        let mut rows = Rows::table(columns(targets), json, self.csv, !master.is_ccp());
         let mut collector = Collector::new(columns(targets), &list);
         let started = Instant::now();
         let mut is_over = false;

@@ -2,10 +2,12 @@
 //! trace.
 
 mod load;
+mod named;
 mod signals;
 mod timing;
 
 pub use load::LoadCollector;
+pub use named::NamedValue;
 pub use signals::{MOST_CURVES, SignalCollector};
 pub use timing::TimingCollector;
 

@@ -20,7 +20,7 @@ mod text;
 
 use std::path::Path;
 
-pub use collect::{LoadCollector, MOST_CURVES, SignalCollector, TimingCollector};
+pub use collect::{LoadCollector, MOST_CURVES, NamedValue, SignalCollector, TimingCollector};
 pub use error::PlotError;
 pub use histogram::{Bar, Histogram};
 pub use model::{Axis, Content, Curve, Gap, Pane, Plot};

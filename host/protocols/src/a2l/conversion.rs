@@ -1,5 +1,7 @@
 //! From the number in the ECU's memory to the value that it stands for, and back (COMPU_METHOD).
 
+use super::formula::Formula;
+
 /// How a number becomes a value.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Conversion {
@@ -25,6 +27,8 @@ pub enum Conversion {
     },
     /// A text for each of these ranges, both ends included.
     Texts(Texts),
+    /// By a formula, and back by another, if there is one.
+    Formula(Formula, Option<Formula>),
     /// In a way that is not evaluated.
     Unknown,
 }
@@ -74,6 +78,7 @@ impl Conversion {
             Self::Points { points, is_interpolated, default } => {
                 point_at(points, *is_interpolated, number).or(*default)
             }
+            Self::Formula(formula, _) => Some(formula.value(number)),
             Self::Texts(texts) => return texts.get(number).map_or(Meaning::Nothing, Meaning::Text),
             Self::Unknown => None,
         };
@@ -100,6 +105,7 @@ impl Conversion {
                 }
                 point_at(&swapped, *is_interpolated, value)?
             }
+            Self::Formula(_, inverse) => inverse.as_ref()?.value(value),
             Self::Texts(_) | Self::Unknown => return None,
         };
         number.is_finite().then_some(number)

@@ -6,6 +6,7 @@ use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::conversion::{Conversion, Texts};
 use super::description::Description;
+use super::formula::Formula;
 use super::if_data::EcuConnection;
 use super::object::{Bits, DataType, MemoryObject};
 use crate::calibration::parts::ByteOrder;
@@ -369,7 +370,10 @@ impl Loader<'_> {
             ConversionType::TabIntp => table.and_then(|table| self.points(table, true)),
             ConversionType::TabNointp => table.and_then(|table| self.points(table, false)),
             ConversionType::TabVerb => table.and_then(|table| self.texts(table)).map(Conversion::Texts),
-            ConversionType::Form => None,
+            ConversionType::Form => method.formula.as_ref().and_then(|formula| {
+                let inverse = formula.formula_inv.as_ref().and_then(|inverse| Formula::read(&inverse.gx));
+                Some(Conversion::Formula(Formula::read(&formula.fx)?, inverse))
+            }),
         };
         let status = method.status_string_ref.as_ref().and_then(|table| self.texts(&table.conversion_table));
         if conversion.is_none() {

@@ -1,10 +1,11 @@
 //! A2lDescriptions of what is in an ECU's memory: A2L files (ASAM MCD-2 MC, versions 1.31 to 1.71).
 //!
 //! Read are measured values (MEASUREMENT) and parameters (CHARACTERISTIC: values, blocks of values, text) with their conversions, and, of
-//! IF_DATA, the identifiers and events of XCP and CCP. Formulas, curves, maps and the structures of version 1.7 are left out, and listed.
+//! IF_DATA, the identifiers and events of XCP and CCP. Curves, maps, formulas with operations on bits, and the structures of version 1.7 are left out, and listed.
 
 mod conversion;
 mod description;
+mod formula;
 mod if_data;
 mod load;
 mod object;
@@ -13,6 +14,7 @@ mod tests;
 
 pub use conversion::{Conversion, Meaning, Texts};
 pub use description::{A2lDescriptions, Description};
+pub use formula::Formula;
 pub use if_data::{DaqEvent, EcuConnection};
 pub use load::{A2lError, Include};
 pub use object::{Bits, DataType, MemoryObject, ValueError};

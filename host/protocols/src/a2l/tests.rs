@@ -27,6 +27,7 @@ ASAP2_VERSION 1 61
 /begin MEASUREMENT Power "" FLOAT32_IEEE NO_COMPU_METHOD 1 0 0 1e3 BYTE_ORDER MSB_FIRST ECU_ADDRESS 0x20000004 PHYS_UNIT "kW" /end MEASUREMENT
 /begin MEASUREMENT Array "" SWORD NO_COMPU_METHOD 1 0 0 1 MATRIX_DIM 3 1 1 ECU_ADDRESS 0x20000010 /end MEASUREMENT
 /begin MEASUREMENT Odd "" UBYTE Formula 1 0 0 1 ECU_ADDRESS 0x20000020 /end MEASUREMENT
+/begin MEASUREMENT Pressure "" UBYTE Half 1 0 0 200 ECU_ADDRESS 0x20000030 /end MEASUREMENT
 /begin MEASUREMENT Curved "" UBYTE Curve 1 0 0 1 ECU_ADDRESS 0x20000021 /end MEASUREMENT
 /begin CHARACTERISTIC Idle "" VALUE 0x30000000 Word 0 Rpm 500 1500 /end CHARACTERISTIC
 /begin CHARACTERISTIC Name "" ASCII 0x30000010 Byte 0 NO_COMPU_METHOD 0 255 NUMBER 8 /end CHARACTERISTIC
@@ -36,7 +37,8 @@ ASAP2_VERSION 1 61
 /begin COMPU_METHOD Rpm "" RAT_FUNC "%8.2" "rpm" COEFFS 0 4 0 0 0 1 /end COMPU_METHOD
 /begin COMPU_METHOD Gears "" TAB_VERB "%2.0" "" COMPU_TAB_REF GearTexts /end COMPU_METHOD
 /begin COMPU_METHOD OnOff "" TAB_VERB "%2.0" "" COMPU_TAB_REF OnOffTexts /end COMPU_METHOD
-/begin COMPU_METHOD Formula "" FORM "%2.0" "" /begin FORMULA "X1*2" /end FORMULA /end COMPU_METHOD
+/begin COMPU_METHOD Formula "" FORM "%2.0" "" /begin FORMULA "X1^2" /end FORMULA /end COMPU_METHOD
+/begin COMPU_METHOD Half "" FORM "%2.1" "bar" /begin FORMULA "X1 / 2 + 1" FORMULA_INV "(X1 - 1) * 2" /end FORMULA /end COMPU_METHOD
 /begin COMPU_METHOD Curve "" TAB_INTP "%2.0" "V" COMPU_TAB_REF Points /end COMPU_METHOD
 /begin COMPU_TAB Points "" TAB_INTP 2 0 0.0 100 5.0 /end COMPU_TAB
 /begin COMPU_VTAB GearTexts "" TAB_VERB 2 0 "neutral" 1 "first" DEFAULT_VALUE "?" /end COMPU_VTAB
@@ -63,6 +65,8 @@ fn what_is_in_the_memory_has_names_units_and_texts() {
         fields(0x2000_0020, &[7, 50]),
         ["Odd 7 (as stored; its conversion is not evaluated)", "Curved 2.5 V"]
     );
+    assert_eq!(fields(0x2000_0030, &[7]), ["Pressure 4.5 bar"]);
+    assert_eq!(ecu().object("Pressure").unwrap().conversion.number(4.5), Some(7.0));
     assert_eq!(fields(0x3000_0010, b"demo\0\0\0\0"), ["Name \"demo\""]);
     assert_eq!(fields(0x3000_0010, b"demo"), [""; 0], "not all of it");
     assert_eq!(fields(0xFFFF_FFFF, &[1, 2, 3]), [""; 0]);

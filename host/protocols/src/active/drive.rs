@@ -22,6 +22,9 @@ use crate::canopen::drive::DriveState;
 
 /// How often an object is asked for again because frames were lost on the way to this computer.
 const MOST_REPEATS: u32 = 3;
+/// Where the first axis' objects begin, and how far those of the next one are from them (CiA 402-2).
+const FIRST_OF_PROFILE: u16 = 0x6000;
+const AXIS_STEP: u16 = 0x800;
 /// How much later than its period times 2.5 a heartbeat may arrive here.
 const BEAT_GRACE_NS: u64 = 100_000_000;
 
@@ -36,6 +39,8 @@ struct Access {
 #[derive(Clone, Debug)]
 pub struct DriveClient {
     node: u8,
+    /// What its objects are above those of the first axis.
+    axis_offset: u16,
     timing: DriveTiming,
     plan: Plan,
     sdo: Option<(Access, SdoClient)>,
@@ -58,6 +63,7 @@ impl DriveClient {
     pub fn new(node: u8, timing: DriveTiming) -> Self {
         Self {
             node,
+            axis_offset: 0,
             timing,
             plan: Plan::new(timing),
             sdo: None,
@@ -73,6 +79,18 @@ impl DriveClient {
             looked_ns: 0,
             end: None,
         }
+    }
+
+    /// For this axis of the node, 1 to 8, each of which has its objects 800h above those of the one before. Steps and results name the
+    /// objects of the first; errors those of the axis.
+    #[must_use]
+    pub fn with_axis(self, axis: u8) -> Self {
+        Self { axis_offset: u16::from(axis.clamp(1, 8) - 1) * AXIS_STEP, ..self }
+    }
+
+    /// An object of the first axis as this one has it. Those of the node are the same for all.
+    pub const fn object(&self, index: u16) -> u16 {
+        if index >= FIRST_OF_PROFILE { index + self.axis_offset } else { index }
     }
 
     /// Gives it the next step, after the one before has ended.
@@ -152,7 +170,7 @@ impl DriveClient {
     fn access(&mut self, access: Access) {
         let job = access.data.clone().map_or(SdoJob::Read, SdoJob::Write);
         let (ids, answer_ns) = (SdoIds::of(self.node), self.timing.answer_ns);
-        let client = SdoClient::new(ids, access.index, 0, job, false, answer_ns);
+        let client = SdoClient::new(ids, self.object(access.index), 0, job, false, answer_ns);
         self.sdo = Some((access, client));
     }
 
@@ -178,11 +196,17 @@ impl DriveClient {
                 if index == HEARTBEAT {
                     self.beat_ns = Some(now_ns);
                 }
-                self.plan.keep(index, &data).map(|()| Input::Read(index))
+                let kept = self.plan.keep(index, &data).map(|()| Input::Read(index));
+                kept.map_err(|error| match error {
+                    DriveError::Length { bytes, .. } => {
+                        DriveError::Length { index: self.object(index), bytes }
+                    }
+                    error => error,
+                })
             }
             Err(SdoError::Aborted { .. }) if is_read && is_optional => Ok(Input::Read(index)),
             Err(_) if self.plan.reads_fault() => Ok(Input::Read(index)),
-            Err(error) => Err(DriveError::Sdo { index, error }),
+            Err(error) => Err(DriveError::Sdo { index: self.object(index), error }),
         };
         self.go(now_ns, input);
     }
@@ -247,7 +271,10 @@ impl Machine for DriveClient {
             }
             (0x580, _) => {
                 let object = <[u8; 8]>::try_from(data).ok().map(SdoObject::decode);
-                let asked = self.sdo.as_ref().map(|(access, _)| SdoObject { index: access.index, sub: 0 });
+                let asked = self
+                    .sdo
+                    .as_ref()
+                    .map(|(access, _)| SdoObject { index: self.object(access.index), sub: 0 });
                 self.has_stray_answer |= asked.is_none() || object.is_some() && object != asked;
             }
             (0x600, _) => self.has_rival = true,

@@ -9,6 +9,7 @@ pub mod calibration;
 mod calibration_tests;
 pub mod drive;
 pub mod exchange;
+pub mod heartbeat;
 pub mod lss;
 pub mod node_scan;
 mod rivals;

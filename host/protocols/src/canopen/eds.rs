@@ -86,12 +86,17 @@ pub fn number(text: &str, node: u8) -> Option<i128> {
 }
 
 impl Eds {
-    /// Parses a file's text, in UTF-8 or else Latin-1: only names contain non-ASCII characters.
+    /// Parses a file's text, in UTF-8 or else Latin-1: only names contain non-ASCII characters. A sheet in XML (XDD, XDC) is recognised by how it
+    /// begins.
     pub fn parse(bytes: &[u8]) -> Self {
         let mut eds = Self::default();
         let latin = || bytes.iter().map(|byte| char::from(*byte)).collect();
         let text = str::from_utf8(bytes).map_or_else(|_| latin(), str::to_owned);
-        let sections = eds.sections(text.trim_start_matches('\u{FEFF}'));
+        let text = text.trim_start_matches('\u{FEFF}');
+        if super::xdd::is_xml(text) {
+            return super::xdd::parse(text);
+        }
+        let sections = eds.sections(text);
         if let Some(info) = sections.get("deviceinfo") {
             (eds.product, eds.vendor) = (info.text("productname"), info.text("vendorname"));
         } else {

@@ -22,6 +22,7 @@ mod states;
 mod tests;
 mod transfers;
 mod types;
+mod xdd;
 
 pub use encode::{BadValue, encode, type_named};
 pub use names::{abort as abort_text, state as state_name};

@@ -20,6 +20,8 @@ pub mod command {
     pub const START_STOP: u8 = 0x06;
     pub const DISCONNECT: u8 = 0x07;
     pub const START_STOP_ALL: u8 = 0x08;
+    pub const SET_S_STATUS: u8 = 0x0C;
+    pub const GET_S_STATUS: u8 = 0x0D;
     pub const SHORT_UP: u8 = 0x0F;
     pub const GET_SEED: u8 = 0x12;
     pub const UNLOCK: u8 = 0x13;
@@ -76,8 +78,8 @@ pub const COMMANDS: &[CommandDefinition] = &[
         &[],
     ),
     command(0x09, "GET_ACTIVE_CAL_PAGE", &[], &[Number("extension", 1), Hex("address", 4)]),
-    command(0x0C, "SET_S_STATUS", &[Bits("status", SESSION)], &[]),
-    command(0x0D, "GET_S_STATUS", &[], &[Bits("status", SESSION), Hex("additional", 1)]),
+    command(command::SET_S_STATUS, "SET_S_STATUS", &[Bits("status", SESSION)], &[]),
+    command(command::GET_S_STATUS, "GET_S_STATUS", &[], &[Bits("status", SESSION), Hex("additional", 1)]),
     command(0x0E, "BUILD_CHKSUM", &[Number("block_size", 4)], &[Number("length", 1), Hex("checksum", 4)]),
     command(
         command::SHORT_UP,

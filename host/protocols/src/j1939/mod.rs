@@ -7,6 +7,7 @@
 mod diagnostics;
 mod fast_packet;
 mod header;
+mod isobus;
 mod name;
 mod names;
 mod parameters;
@@ -258,6 +259,7 @@ impl J1939 {
             }
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
+                    && !isobus::fields(header, data, &mut event)
                     && !diagnostics::fields(header.pgn, data, &mut event.fields)
                     && !parameters::fields(header.pgn, data, &mut event.fields)
                     && !self.marine_fields(record.channel, header, data, &mut event)

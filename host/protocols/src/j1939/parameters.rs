@@ -20,12 +20,14 @@ struct Parameter {
     /// From the lowest bit of the first byte.
     bit: u32,
     bits: u32,
-    spn: u32,
+    /// `None` where it is not known.
+    spn: Option<u32>,
     name: &'static str,
     unit: &'static str,
     scale: Scale,
     offset: f64,
-    is_switch: bool,
+    /// The names of its states, from 0 on; empty where a state has none.
+    states: Vec<&'static str>,
 }
 
 /// The parameters in the order of the table, and where each group's begin and end in it.
@@ -42,7 +44,7 @@ static PARAMETERS: LazyLock<Parameters> = LazyLock::new(|| {
     for (at, parameter) in all.iter().enumerate() {
         groups.entry(parameter.pgn).or_insert((at, at)).1 = at + 1;
     }
-    let names = all.iter().map(|parameter| (parameter.spn, parameter.name)).collect();
+    let names = all.iter().filter_map(|parameter| Some((parameter.spn?, parameter.name))).collect();
     Parameters { all, groups, names }
 });
 
@@ -54,15 +56,15 @@ impl Parameter {
             pgn: u32::from_str_radix(pgn, 16).ok()?,
             bit: bit.parse().ok()?,
             bits: bits.parse().ok()?,
-            spn: spn.parse().ok()?,
+            spn: if spn.is_empty() { None } else { Some(spn.parse().ok()?) },
             name,
             unit,
             scale: Scale::read(factor)?,
             offset: offset.parse().ok()?,
-            is_switch: match states {
-                "switch" => true,
-                "" => false,
-                _ => return None,
+            states: match states {
+                "switch" => vec!["off", "on"],
+                "" => Vec::new(),
+                states => states.split('|').collect(),
             },
         })
     }
@@ -73,8 +75,9 @@ impl Parameter {
             Some(Absence::NotAvailable) => Field::missing(self.name),
             Some(Absence::Error) => Field::missing(self.name).meaning(Some("error")),
             Some(Absence::Reserved) => Field::missing(self.name).meaning(Some("reserved")),
-            None if self.is_switch => {
-                Field::number(self.name, raw as i64).meaning(Some(if raw == 0 { "off" } else { "on" }))
+            None if !self.states.is_empty() => {
+                let state = self.states.get(raw as usize).copied().filter(|state| !state.is_empty());
+                Field::number(self.name, raw as i64).meaning(state)
             }
             // States by number.
             None if self.bits < 8 => Field::number(self.name, raw as i64),
@@ -140,7 +143,7 @@ mod tests {
             assert!(matches!(parameter.bits, 1..8 | 8 | 16 | 32), "{line}");
             let (Scale::Times(scale) | Scale::Over(scale)) = parameter.scale;
             assert!(parameter.bit + parameter.bits <= 64 && scale > 0.0, "{line}");
-            assert!(!parameter.is_switch || parameter.bits == 2, "{line}");
+            assert!(parameter.states.len() < 1 << parameter.bits, "{line}");
             // The lines of a group follow each other.
             assert!(parameter.pgn == before || !taken.contains_key(&parameter.pgn), "{line}");
             before = parameter.pgn;
@@ -148,7 +151,9 @@ mod tests {
             let taken = taken.entry(parameter.pgn).or_default();
             assert_eq!(*taken & bits, 0, "{line}");
             *taken |= bits;
-            assert_eq!(name(parameter.spn), Some(parameter.name), "two names: {line}");
+            if let Some(spn) = parameter.spn {
+                assert_eq!(name(spn), Some(parameter.name), "two names: {line}");
+            }
         }
         assert!(taken.len() > 35);
     }
@@ -173,6 +178,32 @@ mod tests {
             shown(0xFEEE, [130, 60, 0x00, 0x2D, 0xFF, 0xFF, 0xFC, 0])
                 .contains("engine_oil_temperature 87 °C")
         );
+    }
+
+    /// By hand from the scalings of AgIsoStack++: 0.001 m/s and m, 1/4 per km from −8032; of ISO 11783-7: 0.4 %, 10 N from −320 kN, 1/8 rpm.
+    #[test]
+    fn a_tractor_and_its_implement_say_how_fast_and_where() {
+        assert_eq!(
+            shown(0xFE48, [0xB8, 0x0B, 0x40, 0x42, 0x0F, 0x00, 0xFF, 0xD5]),
+            "wheel_based_machine_speed 3 m/s, wheel_based_machine_distance 1000 m, tractor_power_time not available, \
+             wheel_based_direction 1 (forward), key_switch 1 (not off), implement_operations 1 (start), operator_direction not available"
+        );
+        assert_eq!(
+            shown(0xFE45, [125, 0x7F, 0x7D, 0x64, 0x7D, 0xFF, 0xFF, 0xFF]),
+            "rear_hitch_position 50 %, rear_hitch_limit not available, rear_hitch_in_work 1 (yes), rear_lower_link_force 0 %, \
+             rear_hitch_draft 1000 N"
+        );
+        assert!(
+            shown(0xFE43, [0xE0, 0x10, 0xE0, 0x10, 0x53, 0xFF, 0xFF, 0xFF])
+                .starts_with("rear_pto_speed 540 rpm")
+        );
+        assert!(
+            shown(0xAD00, [0x90, 0x7D, 0xFD, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF])
+                .starts_with("commanded_curvature 4 1/km")
+        );
+        assert!(shown(0xFE13, [225, 125, 0xF1, 0xFF, 0xFF, 0xFF, 0xFF, 0xFF]).starts_with(
+            "extend_flow 100 %, retract_flow 0 %, valve_state 1 (extend), fail_safe not available"
+        ));
     }
 
     #[test]

@@ -84,11 +84,11 @@ impl CcpServer {
                 self.is_identifying = Some(0);
                 Ok(vec![self.identification.len() as u8, 1, 0x03, 0x00])
             }
-            0x0C => {
+            command::SET_S_STATUS => {
                 self.status = data[2];
                 Ok(Vec::new())
             }
-            0x0D => Ok(vec![self.status, 0]),
+            command::GET_S_STATUS => Ok(vec![self.status, 0]),
             command::SET_MTA => {
                 self.is_identifying = None;
                 if data[2] == 0 {

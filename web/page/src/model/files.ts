@@ -19,7 +19,7 @@ export async function* pieces(file: Blob): AsyncGenerator<Piece, void, void> {
   } while (at < file.size);
 }
 
-const DATABASES = /\.(dbc|kcd|sym|arxml|dbf|xml|eds|dcf)$/i;
+const DATABASES = /\.(dbc|kcd|sym|arxml|dbf|xml|eds|dcf|xdd|xdc|a2l|cdd|pdx|odx[a-z-]*|dsdl|uavcan)$/i;
 
 /** Whether a file is taken for a database by its name; all else is taken for a trace. */
 export function isDatabase(name: string): boolean {

@@ -1,9 +1,10 @@
-//! The curves of signals.
+//! The curves of signals, and of values that something else than a database has named.
 
 use std::collections::HashMap;
 
 use super::super::layout::vertical_range;
 use super::super::model::{Content, Curve, PALETTE, Pane, Plot};
+use super::named::{Named, NamedValue, distinct_names};
 use super::{Gaps, TimeAxis};
 use crate::Cadence;
 use cantap_signals::{Decoder, MessageRef, Signal, SignalValue};
@@ -12,7 +13,7 @@ use cantap_trace::TraceRecord;
 /// The default limit of curves in one picture: more could hardly be told apart.
 pub const MOST_CURVES: usize = 24;
 
-/// Collects the curves of the signals selected in a decoder.
+/// Collects the curves of the signals selected in a decoder, and of [`NamedValue`]s.
 pub struct SignalCollector<'a> {
     decoder: &'a Decoder,
     axis: TimeAxis,
@@ -20,6 +21,8 @@ pub struct SignalCollector<'a> {
     end: f64,
     /// Curve of each signal: channel, message, signal.
     places: HashMap<(u8, MessageRef, u32), usize>,
+    /// Curve of each value that has a name of its own, by channel.
+    named: HashMap<(u8, Named), usize>,
     curves: Vec<Collected>,
     most_curves: usize,
     left_out: u64,
@@ -28,12 +31,19 @@ pub struct SignalCollector<'a> {
 
 struct Collected {
     channel: u8,
-    message: MessageRef,
-    signal: u32,
+    of: Of,
+    unit: String,
     curve: Curve,
     digital: bool,
     state: bool,
     cadence: Cadence,
+}
+
+/// What a curve shows. Signals come before others.
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+enum Of {
+    Signal(MessageRef, u32),
+    Named(Named),
 }
 
 impl<'a> SignalCollector<'a> {
@@ -45,6 +55,7 @@ impl<'a> SignalCollector<'a> {
             gaps: Gaps::default(),
             end: 0.0,
             places: HashMap::new(),
+            named: HashMap::new(),
             curves: Vec::new(),
             most_curves: MOST_CURVES,
             left_out: 0,
@@ -94,8 +105,8 @@ impl<'a> SignalCollector<'a> {
             std::collections::hash_map::Entry::Vacant(vacant) => {
                 curves.push(Collected {
                     channel,
-                    message,
-                    signal: value.signal,
+                    of: Of::Signal(message, value.signal),
+                    unit: signal.unit.clone(),
                     curve: curve_of(signal),
                     digital: signal.digital.is_some() || signal.length == 1,
                     state: false,
@@ -123,6 +134,49 @@ impl<'a> SignalCollector<'a> {
         collected.curve.series.push(x, y);
     }
 
+    /// Takes a value that something else than a database has named; one that is missing interrupts its curve. Records and values come in the order of their times.
+    pub fn push_named(&mut self, value: &NamedValue<'_>) {
+        let x = self.axis.seconds(value.time_ns);
+        self.end = self.end.max(x);
+        let key = (value.channel, Named::of(value));
+        let place = match self.named.get(&key) {
+            Some(place) => *place,
+            None if value.value.is_nan() => return,
+            None if self.curves.len() >= self.most_curves => {
+                self.left_out += 1;
+                return;
+            }
+            None => {
+                self.curves.push(Collected {
+                    channel: value.channel,
+                    of: Of::Named(key.1.clone()),
+                    unit: value.unit.to_owned(),
+                    curve: Curve::new(value.name.to_owned()),
+                    digital: false,
+                    state: false,
+                    cadence: Cadence::new(None),
+                });
+                self.named.insert(key, self.curves.len() - 1);
+                self.curves.len() - 1
+            }
+        };
+        let collected = &mut self.curves[place];
+        if collected.cadence.arrive(value.time_ns) {
+            collected.curve.series.interrupt();
+        }
+        if let Some(text) = value.text.filter(|_| value.value.is_finite()) {
+            collected.curve.stepped = true;
+            let texts = &mut collected.curve.texts;
+            // A text belongs to one number, exactly.
+            if texts.len() < MOST_TEXTS
+                && !texts.iter().any(|(known, _)| known.total_cmp(&value.value).is_eq())
+            {
+                texts.push((value.value, text.to_owned()));
+            }
+        }
+        collected.curve.series.push(x, value.value);
+    }
+
     /// The number of values of signals beyond the limit of curves.
     pub fn left_out(&self) -> u64 {
         self.left_out
@@ -140,23 +194,23 @@ impl<'a> SignalCollector<'a> {
         let mut panes: Vec<Pane> = Vec::new();
         let mut digital = Vec::new();
         // Signals come in the order of their first frames, but are easier to find by message and position.
-        self.curves.sort_by_key(|collected| (collected.channel, collected.message, collected.signal));
-        for collected in self.curves {
-            let signal = &self.decoder.message(collected.message).signals[collected.signal as usize];
+        self.curves.sort_by(|a, b| (a.channel, &a.of).cmp(&(b.channel, &b.of)));
+        for mut collected in self.curves {
+            collected.curve.texts.sort_by(|(a, _), (b, _)| a.total_cmp(b));
             if collected.digital {
                 digital.push(collected.curve);
                 continue;
             }
             let has_room = |pane: &&mut Pane| {
-                !signal.unit.is_empty()
-                    && pane.label == signal.unit
+                !collected.unit.is_empty()
+                    && pane.label == collected.unit
                     && pane.content.curves().len() < PALETTE.len()
             };
             let same_unit = panes.iter_mut().find(has_room);
             match same_unit.map(|pane| &mut pane.content) {
                 Some(Content::Analogue(curves)) => curves.push(collected.curve),
                 _ => panes.push(Pane {
-                    label: signal.unit.clone(),
+                    label: collected.unit,
                     range: None,
                     content: Content::Analogue(vec![collected.curve]),
                 }),
@@ -169,17 +223,29 @@ impl<'a> SignalCollector<'a> {
         Plot { title, axis: self.axis.axis(), panes, gaps: self.gaps.finish(self.end) }
     }
 
-    /// Names curves by signal, adding message and channel where the name would be ambiguous.
+    /// Names curves by signal, adding message and channel where the name would be ambiguous; values with a name of their own by that.
     fn name_curves(&mut self) {
-        let names: Vec<_> = self
+        let mut names: Vec<_> = self
             .curves
             .iter()
-            .map(|collected| {
-                let message = self.decoder.message(collected.message);
-                let name = &message.signals[collected.signal as usize].name;
-                (name.clone(), format!("{}.{name}", message.name), collected.channel)
+            .map(|collected| match &collected.of {
+                Of::Signal(message, signal) => {
+                    let message = self.decoder.message(*message);
+                    let name = &message.signals[*signal as usize].name;
+                    (name.clone(), format!("{}.{name}", message.name), collected.channel)
+                }
+                Of::Named(named) => (named.name.clone(), String::new(), collected.channel),
             })
             .collect();
+        let named = self.curves.iter().map(|collected| match &collected.of {
+            Of::Signal(..) => None,
+            Of::Named(named) => Some((collected.channel, named)),
+        });
+        for (name, distinct) in names.iter_mut().zip(distinct_names(&named.collect::<Vec<_>>())) {
+            if let Some(distinct) = distinct {
+                (name.0, name.1) = (distinct.clone(), distinct);
+            }
+        }
         for (index, (name, full, channel)) in names.iter().enumerate() {
             let others =
                 || names.iter().enumerate().filter(|(other, _)| *other != index).map(|(_, name)| name);

@@ -39,6 +39,8 @@ enum Lie {
     Silent,
     Long,
     FollowingError,
+    /// Instead of losing its voltage it starts, and is ready to switch on again.
+    Flaps,
 }
 
 /// A drive, by CiA 402's state machine.
@@ -53,6 +55,8 @@ struct Drive {
     polls: u32,
     log: Vec<u16>,
     fault: u16,
+    /// What its objects are above those of the first axis.
+    axis: u16,
 }
 
 impl Drive {
@@ -67,6 +71,7 @@ impl Drive {
             polls: 0,
             log: Vec::new(),
             fault: 0,
+            axis: 0,
         }
     }
 
@@ -78,6 +83,8 @@ impl Drive {
         self.polls += 1;
         let state = match (self.lie, self.state) {
             (Lie::Frozen, _) => State::SwitchOnDisabled,
+            (Lie::Flaps, _) if self.polls % 2 == 0 => State::NotReadyToSwitchOn,
+            (Lie::Flaps, _) => State::ReadyToSwitchOn,
             (Lie::NoState, State::ReadyToSwitchOn) => return 0x0001,
             (_, state) => state,
         };
@@ -135,6 +142,15 @@ impl Drive {
         }
     }
 
+    /// 0 for the objects of another axis.
+    fn of_first_axis(&self, index: u16) -> u16 {
+        if index < 0x6000 {
+            index
+        } else {
+            index.checked_sub(self.axis).filter(|index| *index < 0x6800).unwrap_or(0)
+        }
+    }
+
     fn answer(&mut self, request: SdoRequest, say: &mut Say) -> Option<SdoResponse> {
         let expedited = |bytes: &[u8]| Content::expedited(bytes).unwrap();
         Some(match request {
@@ -142,7 +158,7 @@ impl Drive {
                 SdoResponse::Abort(object, 0x0602_0000)
             }
             SdoRequest::Upload(object) => {
-                let bytes = match object.index {
+                let bytes = match self.of_first_axis(object.index) {
                     0x6041 if self.lie == Lie::Long => vec![0; 3],
                     0x6041 => self.statusword().to_le_bytes().to_vec(),
                     0x6061 => self.mode.to_le_bytes().to_vec(),
@@ -156,7 +172,7 @@ impl Drive {
             }
             SdoRequest::Download(object, Content::Expedited { bytes, .. }) => {
                 let number = u32::from_le_bytes(bytes);
-                match object.index {
+                match self.of_first_axis(object.index) {
                     0x6040 => {
                         self.control(number as u16);
                         if self.log.len() == 2 {
@@ -233,6 +249,32 @@ fn a_drive_is_enabled_and_disabled_state_by_state() {
     assert_eq!(drive.log, [0x07, 0x06, 0x00]);
     let down = [State::SwitchedOn, State::ReadyToSwitchOn, State::SwitchOnDisabled];
     assert_eq!(client.take_states(), down);
+}
+
+/// A node with several axes has their objects 800h apart; those that are no part of the profile are common.
+#[test]
+fn another_axis_is_commanded_by_its_own_objects() {
+    let mut drive = Drive { axis: 0x1000, ..Drive::new(Lie::None) };
+    let mut third = DriveClient::new(5, DriveTiming::default()).with_axis(3);
+    for step in [DriveStep::Inspect, DriveStep::SetMode(3), DriveStep::Enable] {
+        assert_eq!(one(&mut third, &mut drive, step), Ok(()));
+    }
+    assert_eq!((drive.state, drive.mode, third.values().position), (State::OperationEnabled, 3, Some(5000)));
+    assert_eq!((third.object(0x6041), third.object(0x1017)), (0x7041, 0x1017));
+    let mut first = DriveClient::new(5, DriveTiming::default());
+    let error = one(&mut first, &mut drive, DriveStep::Stop).unwrap_err();
+    assert!(matches!(error, DriveError::Sdo { index: 0x6041, .. }), "{error}");
+    assert_eq!(drive.state, State::OperationEnabled);
+    let error =
+        one(&mut DriveClient::new(5, DriveTiming::default()).with_axis(2), &mut drive, DriveStep::Inspect);
+    assert!(matches!(error, Err(DriveError::Sdo { index: 0x6841, .. })), "{error:?}");
+}
+
+/// A drive that starts anew whenever it should lose its voltage must not be commanded for ever.
+#[test]
+fn a_drive_that_goes_back_and_forth_is_given_up() {
+    let (_, result) = steps(&mut Drive::new(Lie::Flaps), &[DriveStep::Disable]);
+    assert_eq!(result, Err(DriveError::Restless { commands: 11 }));
 }
 
 /// From each state that it can be found in.

@@ -1,0 +1,168 @@
+//! Selects fields of events by name, for pictures.
+
+use cantap_signals::SelectionError;
+use glob::Pattern;
+
+use crate::{Event, Protocol, Value, naming};
+
+/// Names of fields as in [`naming`], with `*`, `?` and `[a-z]`: `j1939.engine_speed`, `obd.*`, `xcp.enginespeed`.
+#[derive(Clone, Debug, Default)]
+pub struct FieldSelection {
+    patterns: Vec<(Protocol, Pattern, String)>,
+    /// Whether each of them has matched.
+    matched: Vec<bool>,
+}
+
+/// A number in an event.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FieldValue<'a> {
+    /// The protocol, a dot, and the field: `j1939.engine_speed`.
+    pub name: String,
+    /// What tells it from others of that name: who said it to whom, the message, and those of its fields that say which of several things it is
+    /// about, such as `did 0xF190` or `instance 1`. Always three.
+    pub parts: [String; 3],
+    /// Empty without one.
+    pub unit: &'a str,
+    /// Not a number where the message says that there is none.
+    pub value: f64,
+    /// What the value stands for.
+    pub text: Option<&'a str>,
+}
+
+impl FieldSelection {
+    /// Adds a name or pattern; false if it does not begin with a protocol and a dot, so that it names no field.
+    pub fn add(&mut self, pattern: &str) -> Result<bool, SelectionError> {
+        let Some((protocol, field)) = naming::parts_of_pattern(pattern) else { return Ok(false) };
+        let compiled = Pattern::new(&field)
+            .map_err(|source| SelectionError::Malformed { pattern: pattern.to_owned(), source })?;
+        self.patterns.push((protocol, compiled, pattern.to_owned()));
+        self.matched.push(false);
+        Ok(true)
+    }
+
+    /// Whether nothing is selected.
+    pub fn is_empty(&self) -> bool {
+        self.patterns.is_empty()
+    }
+
+    /// The protocols in the names, each once.
+    pub fn protocols(&self) -> Vec<Protocol> {
+        let mut protocols: Vec<_> = self.patterns.iter().map(|(protocol, ..)| *protocol).collect();
+        protocols.sort_unstable();
+        protocols.dedup();
+        protocols
+    }
+
+    /// The patterns that have matched no number yet.
+    pub fn unmatched(&self) -> impl Iterator<Item = &str> {
+        let all = self.patterns.iter().zip(&self.matched);
+        all.filter(|(_, matched)| !**matched).map(|((.., text), _)| text.as_str())
+    }
+
+    /// The event's selected numbers.
+    pub fn take<'a>(&mut self, event: &'a Event) -> Vec<FieldValue<'a>> {
+        if !self.patterns.iter().any(|(protocol, ..)| *protocol == event.protocol) {
+            return Vec::new();
+        }
+        let mut values = Vec::new();
+        let fields = naming::fields(event);
+        for (name, field) in &fields {
+            let value = match field.value {
+                Value::Missing => f64::NAN,
+                _ => match field.value.as_number() {
+                    Some(value) => value,
+                    None => continue,
+                },
+            };
+            let first = naming::plain(&field.name);
+            let mut is_selected = false;
+            for ((protocol, pattern, _), matched) in self.patterns.iter().zip(&mut self.matched) {
+                if *protocol == event.protocol && (pattern.matches(name) || pattern.matches(&first)) {
+                    is_selected = true;
+                    *matched |= value.is_finite();
+                }
+            }
+            if is_selected {
+                values.push(FieldValue {
+                    name: format!("{}.{name}", event.protocol),
+                    parts: [
+                        format!("{} > {}", event.from, event.to),
+                        event.title.to_string(),
+                        which(&fields, name),
+                    ],
+                    unit: &field.unit,
+                    value,
+                    text: field.text.as_deref(),
+                });
+            }
+        }
+        values
+    }
+}
+
+/// Which of several things a field is about.
+fn which(fields: &[(String, &crate::Field)], of: &str) -> String {
+    let keys = fields.iter().filter(|(name, field)| {
+        name != of
+            && naming::is_key(name)
+            && field.value.as_number().is_some_and(|number| number.fract() == 0.0)
+    });
+    let keys: Vec<_> = keys.map(|(name, field)| format!("{name} {}", field.value)).collect();
+    keys.join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::at;
+    use crate::{Options, Reader};
+
+    fn values(patterns: &[&str], frames: &[(f64, &str)]) -> (Vec<String>, Vec<String>) {
+        let mut selection = FieldSelection::default();
+        patterns.iter().for_each(|pattern| assert!(selection.add(pattern).unwrap()));
+        let mut reader = Reader::new(Options { protocols: selection.protocols(), ..Options::default() });
+        let mut events = Vec::new();
+        frames.iter().for_each(|(ms, frame)| reader.push(&at(*ms, frame), &mut events));
+        reader.finish(&mut events);
+        let mut said = Vec::new();
+        for event in &events {
+            for FieldValue { name, parts, unit, value, text } in selection.take(event) {
+                said.push(format!("{name} {value} {unit} {} [{}]", text.unwrap_or("-"), parts.join("; ")));
+            }
+        }
+        (said, selection.unmatched().map(str::to_owned).collect())
+    }
+
+    #[test]
+    fn numbers_are_selected_by_the_names_that_conditions_have() {
+        let engine = [(0.0, "0CF00400#017DA06813FFF0FF"), (10.0, "0CF00401#017DA0FFFFFFF0FF")];
+        let (said, unmatched) = values(&["j1939.engine_speed", "J1939.Engine_Starter*", "obd.*"], &engine);
+        assert_eq!(
+            said,
+            [
+                "j1939.engine_speed 621 rpm - [0 > all; EEC1 engine; ]",
+                "j1939.engine_starter_mode 0  - [0 > all; EEC1 engine; ]",
+                "j1939.engine_speed NaN  - [1 > all; EEC1 engine; ]",
+                "j1939.engine_starter_mode 0  - [1 > all; EEC1 engine; ]",
+            ]
+        );
+        assert_eq!(unmatched, ["obd.*"]);
+    }
+
+    /// Two identifiers of one ECU are not one curve.
+    #[test]
+    fn what_a_value_is_about_is_part_of_its_name() {
+        let talk =
+            [(0.0, "7E0#03221234"), (1.0, "7E8#0462123405"), (2.0, "7E0#03222345"), (3.0, "7E8#0462234506")];
+        let (said, _) = values(&["uds.sid"], &talk);
+        assert!(said[0].contains("did 0x1234") && said[1].contains("did 0x2345"), "{said:?}");
+    }
+
+    #[test]
+    fn names_of_signals_are_not_fields() {
+        let add = |pattern| FieldSelection::default().add(pattern);
+        assert!(add("obd.*").unwrap() && add("XCP.Speed").unwrap());
+        assert!(!add("Engine.Speed").unwrap() && !add("Speed").unwrap() && !add("uds.").unwrap());
+        assert!(add("obd.[").is_err());
+    }
+}

@@ -365,7 +365,7 @@ impl Bus {
                 let of = &status.channels[channel.index()];
                 channels.push(ChannelState {
                     channel: channel_number(board, channel),
-                    bitrate: config.timing.bitrate_bps(clock_hz),
+                    bitrate: config.timing.known_bitrate_bps(clock_hz),
                     state: of.state.name(),
                     counters: (of.tec, of.rec),
                 });

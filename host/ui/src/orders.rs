@@ -148,9 +148,9 @@ impl Bus {
         if state.channels.iter().all(|open| open.channel != channel) {
             bail!("channel {channel} is not open; choose one that is");
         }
-        let rates = state.channels.iter().map(|open| ChannelBitrate {
-            channel: Some(open.channel),
-            bitrate_bps: if open.channel == channel { bitrate_bps } else { open.bitrate },
+        let rates = state.channels.iter().filter_map(|open| {
+            let bitrate_bps = if open.channel == channel { bitrate_bps } else { open.bitrate? };
+            Some(ChannelBitrate { channel: Some(open.channel), bitrate_bps })
         });
         let mut open = self.device.open.clone();
         open.timing.set_bit_rates(rates);

@@ -63,6 +63,10 @@ impl fmt::Display for NoTiming {
 impl core::error::Error for NoTiming {}
 
 impl BitTiming {
+    /// That of a bus whose bit rate somebody else has set, and nobody here knows: only for a device with no bit rate of its own, such as a
+    /// virtual interface or a trace that goes on. No controller can be set to it.
+    pub const UNKNOWN: Self = Self { prescaler: 0, segment1: 0, segment2: 0, jump_width: 0 };
+
     /// Whether every field is in the controller's range.
     pub const fn is_valid(&self) -> bool {
         matches!(self.prescaler, 1..=1024)
@@ -82,7 +86,12 @@ impl BitTiming {
         self.prescaler as u32 * self.quanta()
     }
 
-    /// The bit rate in bit/s, rounded.
+    /// The bit rate in bit/s, rounded, unless it is [`Self::UNKNOWN`].
+    pub const fn known_bitrate_bps(&self, clock_hz: u32) -> Option<u32> {
+        if self.clocks_per_bit() == 0 { None } else { Some(self.bitrate_bps(clock_hz)) }
+    }
+
+    /// The bit rate in bit/s, rounded; 0 if it is [`Self::UNKNOWN`].
     pub const fn bitrate_bps(&self, clock_hz: u32) -> u32 {
         rate_of(clock_hz, self.clocks_per_bit())
     }
@@ -177,7 +186,10 @@ impl BitTiming {
 
 /// The bit rate of a bit that is `clocks` controller clocks long, rounded to whole bit/s.
 const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
-    clock_hz.saturating_add(clocks / 2) / clocks
+    match clock_hz.saturating_add(clocks / 2).checked_div(clocks) {
+        Some(rate) => rate,
+        None => 0,
+    }
 }
 
 #[cfg(test)]
@@ -239,6 +251,17 @@ mod tests {
             Err(NoTiming::Unreachable { below_bps: Some(947_368), above_bps: Some(1_000_000) })
         );
         assert_eq!(BitTiming::choose(CLOCK, 1_000_001, None), Err(NoTiming::OutOfRange));
+    }
+
+    #[test]
+    fn an_unknown_bit_rate_is_none_and_no_controller_takes_it() {
+        let unknown = BitTiming::UNKNOWN;
+        assert_eq!(
+            (unknown.is_valid(), unknown.known_bitrate_bps(CLOCK), unknown.bitrate_bps(CLOCK)),
+            (false, None, 0)
+        );
+        let known = BitTiming::choose(CLOCK, 500_000, None).unwrap();
+        assert_eq!(known.known_bitrate_bps(CLOCK), Some(500_000));
     }
 
     #[test]

@@ -1,8 +1,10 @@
 //! Command-line values that several commands have in common.
 
+use std::path::Path;
 use std::time::Duration;
 
 use cantap::Channel;
+use cantap_address::Address;
 use cantap_trace::grammar;
 use cantap_work::channels::{Channels, channel_number};
 
@@ -40,6 +42,9 @@ pub fn channels(text: &str) -> Result<Channels, String> {
     }
     let numbers = text.split(',').map(channel_number).collect::<Option<Vec<_>>>();
     numbers.map(Channels::of_numbers).ok_or_else(|| {
+        if Address::is_meant_by(Path::new(text)) {
+            return format!("a device is given with -d, as in: -d {text}");
+        }
         "channels are 1, 2, several as 1,3, or both; a second device has 3 and 4, and can0 in a trace is channel 1"
             .to_owned()
     })

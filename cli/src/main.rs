@@ -95,7 +95,11 @@ fn main() -> ExitCode {
         // `cantap … | head` has read enough.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cantap: {}{}", cantap_work::advice::sentence(&error), habits::also(&error));
+            eprintln!(
+                "cantap: {}{}",
+                cantap_work::advice::sentence(&error),
+                habits::also(&error, &arguments)
+            );
             ExitCode::from(match error {
                 error if is_usage_error(&error) => exit::WRONG_COMMAND_LINE,
                 _ if ends_by_itself && interrupt::requested() => interrupt::ENDED_BY_SIGNAL,
@@ -116,7 +120,12 @@ fn leave(mut error: clap::Error, command: Option<&clap::Command>, arguments: &[O
     if let Some(advice) = habits::advice(&error, command, arguments) {
         // A command that is only spelled alike would mislead.
         error.remove(ContextKind::SuggestedSubcommand);
+        error.remove(ContextKind::SuggestedArg);
         error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![advice.into()]));
+    } else if matches!(error.get(ContextKind::InvalidArg), Some(ContextValue::String(arg)) if arg.starts_with('-'))
+    {
+        // That an option may be the name of a file is right, and hardly ever what was meant.
+        error.remove(ContextKind::Suggested);
     }
     error.exit()
 }

@@ -78,10 +78,13 @@ impl Timetable {
         Self { data_bitrates_bps, ..self }
     }
 
-    /// A frame's time on the bus without intermission, in ns.
+    /// A frame's time on the bus without intermission, in ns; 0 where no bit rate is known: such a frame is handed over at its time.
     fn length_ns(&self, channel: Channel, frame: &TraceFrame) -> f64 {
         let bits = frame.bus_bits();
-        let nominal_bps = self.bitrates_bps[channel.index()].max(1);
+        let nominal_bps = self.bitrates_bps[channel.index()];
+        if nominal_bps == 0 {
+            return 0.0;
+        }
         let data_bps = self.data_bitrates_bps[channel.index()].unwrap_or(nominal_bps).max(1);
         f64::from(bits.nominal - INTERMISSION_BITS) * 1e9 / f64::from(nominal_bps)
             + f64::from(bits.data) * 1e9 / f64::from(data_bps)

@@ -194,7 +194,7 @@ impl Seen {
         // A load is computed from times and data, which a channel may leave out.
         let whole = status.open.filter(|config| !config.omit_stamps && !config.omit_data);
         let load_pct =
-            whole.and_then(|config| self.others_since.load_pct(config.timing.bitrate_bps(clock_hz)));
+            whole.and_then(|config| self.others_since.load_pct(config.timing.known_bitrate_bps(clock_hz)?));
         let others_send = self.others_since.span_ns.is_some();
         if load_pct.map_or(others_send && self.stands_still, |load_pct| load_pct >= FULL_PCT) {
             Cause::BusFull { load_pct }

@@ -97,10 +97,11 @@ class Device:
         one_shot: bool = False,
         manual_recovery: bool = False,
         filter: str | Iterable[str] = (),
-    ) -> int:
-        """Opens a channel, 1 or 2, and returns its bit rate in bit/s.
+    ) -> int | None:
+        """Opens a channel, 1 or 2, and returns its bit rate in bit/s, if it is known.
 
-        Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s. `"auto"` finds it by
+        Without a bit rate, the one saved on the device is used; the virtual device's buses have 500 kbit/s. A virtual CAN interface of Linux,
+        a pipe and a socketcand or cannelloni server need none: it is `None` then, and the bus load is unknown. `"auto"` finds it by
         listening, see `autobaud`. A rate is in bit/s, or written as `500k`.
         `sample_point` is in per cent; `segments` is prescaler, segment 1, segment 2 and jump width, instead of a bit rate.
         `filter` as with `cantap.read`: the device drops other frames in hardware as far as it can, and this computer drops the rest.

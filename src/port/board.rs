@@ -65,6 +65,12 @@ pub trait Board<'q, const N: usize> {
         Ok(())
     }
 
+    /// Whether a channel can be open without anybody knowing its bit rate ([`BitTiming::UNKNOWN`](cantap_wire::BitTiming::UNKNOWN)), since
+    /// there is no controller to be set to one: a board has some.
+    fn needs_no_bit_rate(&self) -> bool {
+        false
+    }
+
     /// Whether the controllers transmit CAN FD frames: a board's do not.
     fn sends_fd(&self) -> bool {
         false

@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{ChannelConfig, Defaults, Filter, MAX_FILTERS, Status, capability};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
-use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
+use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 use heapless::{String, Vec};
 
 use crate::bus::capture::Closing;
@@ -518,11 +518,11 @@ impl Commands {
             return Err(Refusal::ChannelOpen);
         }
         let config = if let Some(config) = config {
-            check(&config)?;
+            check(&config, board)?;
             config
         } else {
             let Defaults { config, filters } = saved(channel, board).ok_or(Refusal::NothingSaved)?;
-            check(&config)?;
+            check(&config, board)?;
             // Last, because it is the one step that changes something.
             self.set_filters(channel, &filters, board)?;
             config
@@ -539,7 +539,7 @@ impl Commands {
         if board.is_open(channel) {
             return Err(Refusal::ChannelOpen);
         }
-        check(&config)?;
+        check(&config, board)?;
         self.settings[channel.index()].config = Some(config);
         Ok(Reply::Done)
     }
@@ -644,8 +644,11 @@ impl Commands {
 }
 
 /// Checks that a controller can take a configuration. Outside the range of bit rates, the arithmetic of the deadlines does not hold.
-fn check(config: &ChannelConfig) -> Result<(), Refusal> {
+fn check<'q, const N: usize>(config: &ChannelConfig, board: &impl Board<'q, N>) -> Result<(), Refusal> {
     let timing = &config.timing;
+    if *timing == BitTiming::UNKNOWN && board.needs_no_bit_rate() {
+        return Ok(());
+    }
     let possible =
         timing.is_valid() && (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&timing.bitrate_bps(CAN_CLOCK_HZ));
     if possible { Ok(()) } else { Err(Refusal::BadTiming) }

@@ -225,6 +225,12 @@ fn after_help() -> String {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    // Neither a filter nor a message's name has a point or a slash in it; a shell's `*.log` has made the second name the one to be written.
+    if args.filters.iter().any(|filter| filter.to_string().contains(['.', '/'])) {
+        return Err(usage(
+            "it takes one trace at a time, as in: for trace in *.log; do cantap convert \"$trace\" \"${trace%.log}.asc\"; done",
+        ));
+    }
     refuse_same_file(&args.input, &args.output)?;
     let mut options = args.write.options(None)?;
     if args.is_columns()? {

@@ -23,6 +23,7 @@ use anyhow::{Context, bail};
 use cantap::Channel;
 use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
+use cantap::wire::message::capability;
 use cantap_address::server::PORT;
 use cantap_address::{Address, LinkError};
 #[cfg(unix)]
@@ -325,7 +326,8 @@ fn tell(news: News) {
 /// If nobody may choose a bit rate, there has to be one.
 fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<()> {
     // Those saved on a board that is not there yet are not known.
-    if board.hello().is_none() {
+    let Some(hello) = board.hello() else { return Ok(()) };
+    if hello.capabilities & capability::NO_BIT_RATE != 0 {
         return Ok(());
     }
     let doors = [Door::Unix, Door::Tcp, Door::Socketcand, Door::Gvret, Door::Web, Door::Stdio];

@@ -108,8 +108,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     writeln!(out, "failures     {}", failures_text(&failures))?;
     for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
         let open = state.open.map_or("closed".to_owned(), |config| {
-            let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
-            format!("open, {}, {bitrate} bit/s", config.mode.name())
+            match config.timing.known_bitrate_bps(device.hello().can_clock_hz) {
+                Some(bitrate) => format!("open, {}, {bitrate} bit/s", config.mode.name()),
+                None => format!("open, {}, bit rate not known", config.mode.name()),
+            }
         });
         writeln!(out, "\nchannel {}    {open}", channel.number())?;
         writeln!(out, "  state      {}, TEC {}, REC {}", state.state.name(), state.tec, state.rec)?;
@@ -181,7 +183,7 @@ fn channel_object(channel: Channel, state: &ChannelStatus, hello: &Hello) -> Val
         "channel": channel.number(),
         "open": state.open.is_some(),
         "mode": state.open.map(|config| config.mode.name()),
-        "bitrate_bps": state.open.map(|config| config.timing.bitrate_bps(can_clock_hz)),
+        "bitrate_bps": state.open.and_then(|config| config.timing.known_bitrate_bps(can_clock_hz)),
         "state": state.state.name(),
         "tec": state.tec,
         "rec": state.rec,

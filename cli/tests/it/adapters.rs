@@ -96,6 +96,49 @@ fn fd_frames_that_switch_have_a_load_only_with_their_data_bit_rate() {
     assert_eq!((&without["load"], &without["fd"]), (&Value::Null, &13.into()), "{without}");
 }
 
+/// Where somebody else has set the bit rate, only the load needs it.
+#[test]
+fn no_bit_rate_is_asked_for_where_only_the_load_needs_it() {
+    let log = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters/no-rate.log");
+    let line = |more: &str| format!("capture -d PIPE -n 100 --force {more} -o {}", log.display());
+    let (out, _) = on_pipe("no-rate-json", &line("--json"));
+    let channel = &object(&out)["channels"][0];
+    assert_eq!((&channel["frames"], &channel["bus_load_pct"]), (&100.into(), &Value::Null), "{out}");
+    let (_, err) = on_pipe("no-rate", &line(""));
+    assert!(err.contains("the bit rate is not known: give it with -b"), "{err}");
+    let (out, _) = on_pipe("no-rate-stats", "stats -d PIPE -t 700ms");
+    assert!(out.contains("bit rate unknown: give it with -b"), "{out}");
+    let (out, _) = on_pipe("no-rate-monitor", "monitor PIPE --once -t 700ms --view statistics");
+    assert!(out.contains("100") && !out.contains("0.0 %"), "{out}");
+    // Through a server, too.
+    let (device, _done) = pipe("no-rate-doctor", "(1700000000.5) can0 123#11\n".repeat(50));
+    let (_, out, _) = run(&["doctor", "-d", &device, "--json"]);
+    assert!(!out.contains("cannot find a bit rate"), "{out}");
+    let (device, _done) = pipe("no-rate-serve", "(1700000000.5) can0 123#11\n".repeat(50));
+    let socket = std::env::temp_dir().join(format!("cantap-no-rate-{}.sock", std::process::id()));
+    let _server = Server::start(&format!("-d {device} --unix {}", socket.display()), 1);
+    let (code, _, err) = run(&["status", "-d", &format!("unix:{}", socket.display())]);
+    assert_eq!(code, Some(0), "{err}");
+    let (code, _, err) = run(&[
+        "capture",
+        "-d",
+        &format!("unix:{}", socket.display()),
+        "-t",
+        "300ms",
+        "--force",
+        "-o",
+        log.to_str().unwrap(),
+    ]);
+    assert!(!err.contains("no bit rate") && code != Some(2), "{err}");
+    // And to send, and to replay as a trace has it.
+    let (code, _, err) = run(&["send", "-d", "cannelloni://127.0.0.1:9?listen=0", "1", "123#11"]);
+    assert_eq!(code, Some(0), "{err}");
+    let trace = "(1.0) can0 123#11\n(1.2) can0 123#12\n";
+    std::fs::write(&log, trace).unwrap();
+    let (code, _, err) = run(&["replay", "-d", "cannelloni://127.0.0.1:9?listen=0", log.to_str().unwrap()]);
+    assert_eq!(code, Some(0), "{err}");
+}
+
 /// Runs `cantap` and returns its exit code, standard output and standard error.
 fn run(arguments: &[&str]) -> (Option<i32>, String, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_cantap")).args(arguments).output().unwrap();

@@ -47,12 +47,36 @@ fn other_programs_names_and_files_in_place_of_a_command_get_advice() {
             "one trace at a time, as in: for trace in *.log; do cantap stats \"$trace\"; done",
         ),
         ("capture virtual:car", "a device is given with -d, as in: -d virtual:car"),
+        ("obd virtual:car vin", "a device is given with -d, as in: -d virtual:car"),
+        ("monitor -c virtual:car", "a device is given with -d, as in: -d virtual:car"),
+        ("gen virtual:car", "a device is given with -d, as in: -d virtual:car"),
+        ("obd -d virtual:car dtc", "cantap obd codes"),
+        ("uds -d virtual:car rdbi F190", "cantap uds read F190"),
+        ("compare a.log b.log", "cantap diff shows"),
+        ("cut a.log", "--start 10s --end 20s"),
+        ("plot a.log Speed", "as in: --signal Speed"),
+        ("convert -I a.log -O b.asc", "cantap convert IN OUT"),
+        ("convert a.log b.log b.asc", "one trace at a time"),
+        ("capture -d virtual:car -l", "-o FILE.log records one"),
+        ("capture -d virtual:car -t a", "-t says for how long"),
+        ("capture -d virtual:car --baud 500000", "-b 500k"),
+        ("capture -d virtual:car --duration 3", "-t 10s"),
+        ("monitor -i socketcan", "-d can0"),
+        ("search a.log -Y can.id==1", "cantap search TRACE 'id == 0x123'"),
     ] {
         let arguments: Vec<_> = line.split(' ').collect();
         let (code, out, err) = cantap(folder.path(), &arguments);
         assert!(code == Some(2) && out.is_empty() && err.contains(advice), "{line}: {err}");
         assert!(!err.contains("similar"), "{line}: {err}");
     }
+    // An option that there is not is no file's name.
+    let (_, _, err) = cantap(folder.path(), &["stats", "a.log", "-Z"]);
+    assert!(!err.contains("as a value"), "{err}");
+    // A device in the place of a trace, and an interface in that of a channel.
+    let (code, _, err) = cantap(folder.path(), &["stats", "virtual:car"]);
+    assert!(code == Some(1) && err.contains("; a device is given with -d, as in: -d virtual:car"), "{err}");
+    let (_, _, err) = cantap(folder.path(), &["send", "vcan7", "123#11"]);
+    assert!(!err.contains("no board is connected") || err.contains("cantap send -d vcan7 1"), "{err}");
     // What is only spelled wrongly still gets the nearest, and what is right needs none.
     let (code, _, err) = cantap(folder.path(), &["stat", "a.log"]);
     assert!(code == Some(2) && err.contains("'stats'"), "{err}");

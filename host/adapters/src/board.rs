@@ -16,7 +16,7 @@ use cantap_firmware::ports::{Chip, Clock, EdgeMeter, FilterBanks, PACKET, PinEdg
 use cantap_firmware::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ};
 use cantap_trace::TraceFrame;
 use cantap_wire::message::{ChannelConfig, Failures, MAX_FAILURE_TEXT, Mode, capability};
-use cantap_wire::{CHANNELS, Channel, Command, Hello, Refusal};
+use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Refusal};
 use heapless::String;
 
 use crate::driver::{Driver, Opening};
@@ -271,6 +271,10 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
         }
     }
 
+    fn needs_no_bit_rate(&self) -> bool {
+        !self.driver.row().sets_bit_rate
+    }
+
     fn sends_fd(&self) -> bool {
         self.driver.sends_fd()
     }
@@ -293,7 +297,9 @@ impl<'q> Board<'q, QUEUE_BYTES> for AdapterBoard<'q> {
             Command::Identify { seconds } => self.driver.identify(*seconds),
             // What the firmware refuses anyway must not reach the adapter.
             Command::Open { channel, config: Some(config) }
-                if config.timing.is_valid() && !self.is_open(*channel) =>
+                if (config.timing.is_valid()
+                    || config.timing == BitTiming::UNKNOWN && self.needs_no_bit_rate())
+                    && !self.is_open(*channel) =>
             {
                 self.open_channel(*channel, config)
             }

@@ -167,7 +167,7 @@ impl OpenError {
 /// How a channel is opened.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Opening {
-    /// Bits per second.
+    /// Bits per second; 0 if unknown, where the adapter's row says that it sets none.
     pub bitrate_bps: u32,
     /// Where in the bit, in thousandths of it.
     pub sample_point_permille: u32,

@@ -109,6 +109,14 @@ impl Place {
         }
     }
 
+    /// Whether a bit rate has to be given, since the adapter is set to it. Otherwise it is set elsewhere, or there is none.
+    pub const fn sets_bit_rate(&self) -> bool {
+        !matches!(
+            self.kind,
+            Kind::Socketcan { .. } | Kind::Socketcand { .. } | Kind::Cannelloni { .. } | Kind::Trace { .. }
+        )
+    }
+
     /// The bit rate of the data phases of CAN FD frames, in bit/s, if the adapter's owner or the address has set one.
     pub fn data_bitrate(&self) -> Option<u32> {
         match &self.kind {

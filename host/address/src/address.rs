@@ -201,9 +201,9 @@ impl Address {
         matches!(&self.place, Place::Virtual(options) if options.car)
     }
 
-    /// Whether the bit rate of a bus there is set by somebody else: a simulated vehicle, or a CAN interface's owner.
+    /// Whether the bit rate of a bus there is set by somebody else: a simulated vehicle, a CAN interface's owner, a program that writes a trace.
     pub fn has_bit_rate(&self) -> bool {
-        self.is_car() || matches!(&self.place, Place::Adapter(adapter) if adapter.bitrate().is_some())
+        self.is_car() || matches!(&self.place, Place::Adapter(adapter) if !adapter.sets_bit_rate())
     }
 
     /// Whether a device there can go and come back; one inside this process cannot.

@@ -102,6 +102,18 @@ mod tests {
         assert_eq!(issues, Vec::<String>::new());
     }
 
+    /// Of a frame that has 29 bits nothing else can be meant; one without a direction was received.
+    #[test]
+    fn what_scripts_leave_out_is_no_reason_to_lose_a_frame() {
+        let (log, issues) =
+            as_log("0.1 1 18FEF100 Rx d 1 07\n0.2 2 5C1   d 2 5C C7\n0.3 1 123 r\n0.4 1 8FF Rx d 0\n");
+        assert_eq!(
+            log,
+            "(1506783973.291000) can0 18FEF100#07\n(1506783973.391000) can1 5C1#5CC7\n(1506783973.491000) can0 123#R\n"
+        );
+        assert!(issues.len() == 1 && issues[0].contains("up to 7FF"), "{issues:?}");
+    }
+
     #[test]
     fn damaged_lines_are_issues_and_other_things_are_counted_by_kind() {
         let damaged = "0.2 1 18EBGF00x Rx d 1 00\n0.3 l 100 Rx d 0\n0.3 300 100 Rx d 0\n0.3 1 100 Px d 0\n\
@@ -168,7 +180,7 @@ mod tests {
     #[test]
     fn broken_lines_are_named() {
         let (log, issues) = as_log(
-            "1.0 1 123 Rx d 2 11\n1.0 1 123 Rx d 40 00\n1.0 1 12345678 Rx d 0\nrubbish\n1.0 1 123 Rx\n\
+            "1.0 1 123 Rx d 2 11\n1.0 1 123 Rx d 40 00\n1.0 1 8FF Rx d 0\nrubbish\n1.0 1 123 Rx\n\
              2.0 1 123 Rx d 1 1G\n3.0 1 123 Rx d 1 55\n4.0 1 123 Rx d 8 01 02",
         );
         assert_eq!(log, "(1506783976.191000) can0 123#55\n");
@@ -177,7 +189,7 @@ mod tests {
             [
                 "test, line 7: expected 2 data bytes, found '11'",
                 "test, line 8: expected a data length code of 0 to F, found '40'",
-                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF followed by x, found '12345678'",
+                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF followed by x, found '8FF'",
                 "test, line 10: expected a line that begins with a time in seconds, found 'rubbish'",
                 "test, line 11: expected 'd' or 'r' after the direction, found nothing",
                 "test, line 12: expected 1 data bytes, found '1G'",

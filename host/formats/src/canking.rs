@@ -5,7 +5,8 @@
 //! their digits, eight for an identifier and two for a byte, so the rows show it: see [`Decoder::is_decimal`].
 
 use super::frame_fields::{
-    FdFields, FrameFields, Payload, decimal_byte, fd_len, hex_byte, identifier, length_code,
+    FdFields, FrameFields, Payload, bytes_are_decimal, decimal_byte, fd_len, hex_byte, identifier,
+    length_code,
 };
 use super::issue::Fault;
 use super::row_format::{Line, RowFormat};
@@ -59,20 +60,9 @@ fn columns(line: &[u8]) -> Option<Columns<'_>> {
 }
 
 impl Decoder {
-    /// Whether more bytes are written in a way only decimal numbers are (one or three digits) than in a way only hexadecimal ones
-    /// are (a letter or a leading zero).
     fn is_decimal(rows: &[u8]) -> bool {
         let rows = rows.split(|byte| *byte == b'\n').filter_map(columns);
-        let (mut decimal, mut hexadecimal) = (0, 0);
-        for byte in rows.flat_map(|columns| columns.bytes) {
-            match byte {
-                [b'0', _] => hexadecimal += 1,
-                [_, _] if decimal_byte(byte).is_none() && hex_byte(byte).is_some() => hexadecimal += 1,
-                [_] | [_, _, _] if decimal_byte(byte).is_some() => decimal += 1,
-                _ => {}
-            }
-        }
-        decimal > hexadecimal
+        bytes_are_decimal(rows.flat_map(|columns| columns.bytes))
     }
 
     fn row(&self, columns: &Columns<'_>, line: &[u8]) -> Result<TraceRecord, Fault> {

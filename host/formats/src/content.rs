@@ -3,15 +3,18 @@
 use super::{Format, table};
 
 /// How many bytes to look at.
-pub(crate) const HEAD_BYTES: usize = 256;
+pub(crate) const HEAD_BYTES: usize = 512;
 
 /// Other files that users mistake for traces, by their first bytes.
-const KNOWN: [(&[u8], &str); 11] = [
+const KNOWN: [(&[u8], &str); 14] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
     (b"\x7FELF", "a program"),
     (b"\x89PNG", "a picture"),
     (b"7z\xBC\xAF\x27\x1C", "a 7z archive"),
+    (b"Rar!", "a RAR archive; unpack it first"),
+    (b"icsbin", "a file of Vehicle Spy (.vsb), which saves traces as CSV or ASC, too"),
+    (b"MATLAB 5.0 MAT-file", "a file of MATLAB, whose writetable makes a CSV of a table of frames"),
     (b"VERSION \"", "a DBC database"),
     (b"<", "XML or HTML"),
     (b"{", "JSON"),
@@ -25,6 +28,9 @@ const KNOWN: [(&[u8], &str); 11] = [
 
 /// What else than a trace a file with this beginning is, if that is known.
 pub(crate) fn known(head: &[u8]) -> Option<&'static str> {
+    if head.get(257..262) == Some(b"ustar") {
+        return Some("a tar archive; `tar -xf` unpacks it");
+    }
     let text = head.trim_ascii_start();
     KNOWN.iter().find(|(begin, _)| text.starts_with(begin)).map(|(_, what)| *what)
 }
@@ -91,6 +97,8 @@ mod tests {
             (&b""[..], "an empty file"),
             (b"PK\x03\x04....", "a ZIP archive or spreadsheet"),
             (b"%PDF-1.7", "a PDF document"),
+            (&[&[b'a'; 257][..], b"ustar\0"].concat(), "a tar archive; `tar -xf` unpacks it"),
+            (b"icsbin\x02", "a file of Vehicle Spy (.vsb), which saves traces as CSV or ASC, too"),
             (b"(1.0) can0 123#11\n", "a trace in the format candump"),
             (b"\0\x01\x02", "binary data that begins with 00 01 02"),
             (b"dear diary\ntoday", "text that begins with 'dear diary'"),

@@ -28,6 +28,8 @@ fn kind(word: &[u8]) -> Option<(u8, Kind)> {
         b"R29" => frame(Direction::Rx, true),
         b"T11" => frame(Direction::Tx, false),
         b"T29" => frame(Direction::Tx, true),
+        // As the trace window of CANalyzer has it: `CAN 1`.
+        b"CAN" => return None,
         [b'C', b'A'..=b'Z', b'A'..=b'Z'] => Kind::Comment,
         _ => return None,
     };

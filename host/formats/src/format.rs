@@ -75,4 +75,10 @@ pub enum Format {
     Saleae,
     /// The log of CANServer, a logger for Teslas.
     CanServer,
+    /// The trace window of CANalyzer and CANoe, copied as text.
+    TraceWindow,
+    /// The log of ESPHome's component for CAN.
+    EspHome,
+    /// What sigrok's CAN decoder prints.
+    Sigrok,
 }

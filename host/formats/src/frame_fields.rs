@@ -101,6 +101,21 @@ pub(crate) fn decimal_byte(word: &[u8]) -> Option<u8> {
     text::decimal(word).and_then(|byte| u8::try_from(byte).ok())
 }
 
+/// Whether more bytes are written in a way only decimal numbers are (one or three digits) than in a way only hexadecimal ones are (a letter or a
+/// leading zero).
+pub(crate) fn bytes_are_decimal<'a>(bytes: impl Iterator<Item = &'a [u8]>) -> bool {
+    let (mut decimal, mut hexadecimal) = (0, 0);
+    for byte in bytes {
+        match byte {
+            [b'0', _] => hexadecimal += 1,
+            [_, _] if decimal_byte(byte).is_none() && hex_byte(byte).is_some() => hexadecimal += 1,
+            [_] | [_, _, _] if decimal_byte(byte).is_some() => decimal += 1,
+            _ => {}
+        }
+    }
+    decimal > hexadecimal
+}
+
 /// Checks that an identifier fits its format.
 pub(crate) fn identifier(raw: u32, extended: bool, shown: &[u8]) -> Result<Id, Fault> {
     let (id, expected) = if extended {

@@ -114,6 +114,17 @@ fn tidy(fields: &mut Vec<Field>) {
             break;
         }
     }
+    // A frame without bytes has no layer of data; one whose bytes another protocol took has a length that says so.
+    let has = |fields: &[Field], name: &str| fields.iter().any(|field| field.name == name);
+    for (id, data) in [("can.id", "data.data"), ("can_can_id", "data_data_data")] {
+        if has(fields, id) && !has(fields, data) {
+            fields.push(Field { name: data.to_owned(), value: String::new(), kind: Kind::Text });
+        }
+    }
+    // The same time, in milliseconds alone.
+    if fields.iter().any(|field| field.name == "frame_frame_time_epoch") {
+        fields.retain(|field| field.name != "timestamp");
+    }
     for field in fields.iter_mut() {
         let name = field.name.to_ascii_lowercase();
         if field.kind == Kind::Text && matches!(name.as_str(), "is_rx" | "isrx") {

@@ -210,6 +210,7 @@ impl RowFormat for Decoder {
     fn begin(&mut self, buffered: &[u8]) {
         let (mut ids, mut bytes) = (Vec::new(), Vec::new());
         let (mut has_names, mut waits) = (false, false);
+        let mut lists = Vec::new();
         let mut packet = None;
         for line in buffered.split(|byte| *byte == b'\n') {
             let rest = without_time(line.trim_ascii());
@@ -229,6 +230,7 @@ impl RowFormat for Decoder {
             } else {
                 parts::plain_bytes(rest)
             };
+            lists.extend(here.and_then(parts::list));
             bytes.extend(here.into_iter().flat_map(tokens).skip(skipped));
             waits = parts.id.is_some() && parts.data.is_none();
         }
@@ -236,8 +238,9 @@ impl RowFormat for Decoder {
         if !is_sure {
             self.notes.push(MAY_BE_DECIMAL);
         }
-        let data = bytes.iter().any(|byte| byte.len() == 3 && text::decimal(byte).is_some());
-        self.radix = table::Radix { id: is_decimal, data };
+        let data = bytes.iter().any(|byte| byte.len() == 3 && text::decimal(byte).is_some())
+            || table::lists_are_decimal(&lists);
+        self.radix = table::Radix { id: is_decimal, data, ..table::Radix::default() };
     }
 
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {

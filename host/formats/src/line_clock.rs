@@ -1,6 +1,5 @@
 //! The times that a serial monitor, a terminal or a board's own log put before a line.
 
-use super::calendar::NS_PER_DAY;
 use super::table;
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
@@ -25,13 +24,7 @@ impl LineClock {
     }
 
     fn set(&mut self, time_ns: i64) {
-        const HALF_NS: i64 = NS_PER_DAY / 2;
-        // A clock without a date begins again at midnight.
-        let of_day = (0..NS_PER_DAY).contains(&time_ns);
-        let day_ns = if of_day { self.time_ns - self.time_ns.rem_euclid(NS_PER_DAY) } else { 0 };
-        let day_ns = if day_ns < 3650 * NS_PER_DAY { day_ns } else { 0 };
-        let is_next = of_day && self.has_time && time_ns + day_ns + HALF_NS < self.time_ns;
-        self.time_ns = time_ns + day_ns + if is_next { NS_PER_DAY } else { 0 };
+        self.time_ns = table::going_on(time_ns, self.has_time.then_some(self.time_ns));
         self.has_time = true;
     }
 }

@@ -19,8 +19,8 @@ use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
     asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, canserver,
-    carbus, crtd, csv, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng, printer, rlog,
-    saleae, slcan, table, trc, usbcan,
+    carbus, crtd, csv, esphome, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng,
+    printer, rlog, saleae, sigrok, slcan, table, trace_window, trc, usbcan,
 };
 
 /// One format.
@@ -277,6 +277,33 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| crtd::is_line(head.first),
         has_head: false,
         reader: |_| Box::new(Rows::<crtd::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::TraceWindow,
+        names: &["trace-window"],
+        suffixes: &["txt"],
+        begins: |head| trace_window::is_head(head.text),
+        has_head: false,
+        reader: |_| Box::new(Rows::<trace_window::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::EspHome,
+        names: &["esphome"],
+        suffixes: &["txt", "log"],
+        begins: |head| esphome::is_head(head.bytes),
+        has_head: false,
+        reader: |_| Box::new(Rows::<esphome::Decoder>::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Sigrok,
+        names: &["sigrok"],
+        suffixes: &["txt"],
+        begins: |head| sigrok::is_line(head.first),
+        has_head: false,
+        reader: |_| Box::new(Rows::<sigrok::Decoder>::default()),
         writer: None,
     },
     FormatSpec {

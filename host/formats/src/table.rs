@@ -10,6 +10,9 @@ mod time;
 pub use columns::{BadColumns, Columns};
 pub(crate) use columns::{TypedColumn, TypedForm};
 
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
+
 use super::frame_fields::{FdFields, FrameFields, Payload, identifier};
 use super::interfaces::Interfaces;
 use super::issue::Fault;
@@ -19,14 +22,15 @@ use super::text;
 use super::zone::Zone;
 use cantap_trace::fd::FD_LENGTHS;
 use cantap_trace::{TraceRecord, counted};
-use cells::{byte, direction, id, is_empty, is_list, length, mark, push_bytes};
+pub(crate) use cells::lists_are_decimal;
+use cells::{byte, direction, id, is_bracketed, is_empty, is_list, length, mark, push_bytes};
 use columns::{Form, Role};
 use identifiers::count_rows;
 pub(crate) use identifiers::ids_are_decimal;
 use kind::Kind;
 use layout::{Layout, Separator};
 use time::FileDate;
-pub(crate) use time::date;
+pub(crate) use time::{date, going_on};
 
 const NO_TIMES: &str = "the table has no times: all its frames stand at 0";
 const OTHERS: &str = "columns of the table that have no place in a trace, such as labels, were left out";
@@ -49,6 +53,8 @@ pub(crate) struct Decoder {
     above: usize,
     unit_ns: Option<i64>,
     day: Option<FileDate>,
+    /// The last time of a clock without a date.
+    clock_ns: Option<i64>,
     interfaces: Interfaces,
     radix: Radix,
     /// Whether cells come apart, from columns with types, of which one may have nothing in a row.
@@ -61,6 +67,8 @@ pub(crate) struct Decoder {
 pub(crate) struct Radix {
     pub(crate) id: bool,
     pub(crate) data: bool,
+    /// Of bytes in brackets, as Python prints lists and numpy arrays.
+    pub(crate) lists: bool,
 }
 
 /// Whether a line is the names above the columns of a table, or a row of one without names.
@@ -219,12 +227,13 @@ impl Decoder {
     /// How identifiers and bytes are written, by what is said, and otherwise by what the first rows have.
     fn radix_of(&mut self, layout: &Layout, is_row: bool) -> Result<Radix, Fault> {
         let rows = first_lines(&self.sample);
-        let (mut ids, mut bytes, mut times) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut ids, mut bytes, mut times, mut lists) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let data = layout.place(Role::Data).or(layout.place(Role::Bytes));
         for row in rows.skip(if is_row { 0 } else { self.lines_above_names() + 1 }) {
             let cells = layout.separator.cells(row);
             let at = |role| layout.place(role).and_then(|place| cells.get(place.at)).copied();
             ids.extend(at(Role::Id));
+            lists.extend(at(Role::Data).filter(|cell| is_bracketed(cell)));
             times.extend(at(Role::Time).zip(at(Role::Id)));
             if let Some(first) = layout.place(Role::Bytes) {
                 bytes.extend(cells.iter().skip(first.at).take(layout.byte_columns.min(8)).copied());
@@ -248,8 +257,9 @@ impl Decoder {
                 text::decimal(number).is_some() && (number.len() == 3 || number.len() < byte.len())
             }),
         };
+        let lists = lists_are_decimal(&lists);
         self.take_unit(unit);
-        Ok(Radix { id, data })
+        Ok(Radix { id, data, lists })
     }
 
     fn time_ns(&mut self, cell: &[u8], form: Option<Form>, zone: &Zone) -> Result<i64, Fault> {
@@ -262,9 +272,15 @@ impl Decoder {
             };
             time::number(cell, unit_ns)
         } else {
-            time::stamp(cell, self.day, zone)
-                .or_else(|| time::with_unit(cell))
-                .or_else(|| time::date(cell, zone))
+            time::stamp(cell, self.day, zone).or_else(|| time::with_unit(cell)).or_else(|| {
+                let time_ns = time::date(cell, zone)?;
+                if cell.contains(&b'-') || cell.contains(&b'/') {
+                    return Some(time_ns);
+                }
+                // A clock without a date begins again at midnight.
+                self.clock_ns = Some(time::going_on(time_ns, self.clock_ns));
+                self.clock_ns
+            })
         };
         time_ns.ok_or_else(|| Fault::malformed("a time: a number or a date", cell))
     }
@@ -384,11 +400,16 @@ impl Decoder {
         let mut decimal = self.radix.data;
         let mut bytes = Vec::with_capacity(8);
         if let Some(place) = layout.place(Role::Data) {
-            decimal |= place.form.is_none() && cells.get(place.at).is_some_and(|cell| is_list(cell));
+            let is_decimal_list = |cell: &&[u8]| is_list(cell) || self.radix.lists && is_bracketed(cell);
+            decimal |= place.form.is_none() && cells.get(place.at).is_some_and(is_decimal_list);
             let is_last = layout.separator == Separator::Blanks;
             let end = if is_last { cells.len() } else { (place.at + 1).min(cells.len()) };
             for cell in cells.get(place.at..end).unwrap_or_default() {
-                push_bytes(cell, decimal, &mut bytes)?;
+                if layout.is_base64 {
+                    bytes = STANDARD.decode(cell).map_err(|_| Fault::malformed("bytes in base64", cell))?;
+                } else {
+                    push_bytes(cell, decimal, &mut bytes)?;
+                }
             }
             let fits = |len: usize| {
                 len == bytes.len()

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use cantap::DeviceError;
 use cantap::device::{Link, pipe};
 use cantap::session::Session;
-use cantap_wire::message::{ChannelConfig, EndReason, Role};
+use cantap_wire::message::{ChannelConfig, EndReason, Role, capability};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, Reply};
 
 use crate::audit::Audit;
@@ -132,7 +132,7 @@ impl Board {
     pub fn bitrates_bps(&self) -> [Option<u32>; CHANNELS] {
         let state = self.shared.state();
         let clock_hz = state.hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
-        state.base.map(|config| config.map(|config| config.timing.bitrate_bps(clock_hz)))
+        state.base.map(|config| config.and_then(|config| config.timing.known_bitrate_bps(clock_hz)))
     }
 
     /// The number of clients.
@@ -173,7 +173,9 @@ impl Board {
             refused: self.shared.refused.load(Ordering::Relaxed),
             counts_losses: state.hello.as_ref().is_none_or(Hello::counts_losses),
             channels: state.totals(),
-            bitrates_bps: state.open.map(|open| open.map(|config| config.timing.bitrate_bps(clock_hz))),
+            bitrates_bps: state
+                .open
+                .map(|open| open.and_then(|config| config.timing.known_bitrate_bps(clock_hz))),
         }
     }
 
@@ -335,6 +337,11 @@ fn begin(shared: &Arc<Shared>, link: Link) -> Result<Session<Then>, DeviceError>
             }
             None => match ask(Command::Defaults { channel }) {
                 Ok(Reply::Defaults(saved)) => Some(ChannelConfig::listen_only(saved.config.timing)),
+                Ok(_) | Err(DeviceError::Refused { .. })
+                    if hello.capabilities & capability::NO_BIT_RATE != 0 =>
+                {
+                    Some(ChannelConfig::listen_only(BitTiming::UNKNOWN))
+                }
                 Ok(_) | Err(DeviceError::Refused { .. }) => None,
                 Err(error) => return Err(error),
             },

@@ -341,7 +341,7 @@ impl Client {
                 let opened = self.open(channel, config);
                 if let Ok(Reply::Opened(config)) = &opened {
                     let clock_hz = self.shared.state().hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
-                    let bitrate_bps = config.timing.bitrate_bps(clock_hz);
+                    let bitrate_bps = config.timing.known_bitrate_bps(clock_hz);
                     let mode = config.mode.name();
                     self.note_session(
                         "opened",

@@ -238,7 +238,8 @@ impl Connection {
     fn bus(&self, session: &Session, number: usize) -> Bus {
         let open = session.buses.get(number).and_then(Option::as_ref);
         let known = self.boards[number / CHANNELS].bitrates_bps()[number % CHANNELS];
-        let bitrate_bps = open.map(|bus| bus.config.timing.bitrate_bps(bus.device.hello().can_clock_hz));
+        let bitrate_bps =
+            open.and_then(|bus| bus.config.timing.known_bitrate_bps(bus.device.hello().can_clock_hz));
         Bus {
             is_on: open.is_some(),
             only_listens: open.is_some_and(|bus| bus.sends_in.is_none()),

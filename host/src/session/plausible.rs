@@ -2,7 +2,7 @@
 //! those could be right.
 
 use cantap_wire::message::ChannelConfig;
-use cantap_wire::{Hello, Reply};
+use cantap_wire::{BitTiming, Hello, Reply};
 
 use super::error::DeviceError;
 
@@ -11,7 +11,7 @@ const LEAST_CLOCK_HZ: u32 = 1_000_000;
 
 /// Returns the answer if it is possible.
 pub fn believe(reply: Reply) -> Result<Reply, DeviceError> {
-    let is_wrong = |config: &ChannelConfig| !config.timing.is_valid();
+    let is_wrong = |config: &ChannelConfig| !config.timing.is_valid() && config.timing != BitTiming::UNKNOWN;
     let what = match &reply {
         Reply::Hello(Hello { tick_hz: hz @ ..LEAST_CLOCK_HZ, .. }) => format!("its clock ticks at {hz} Hz"),
         Reply::Hello(Hello { can_clock_hz: hz @ ..LEAST_CLOCK_HZ, .. }) => {

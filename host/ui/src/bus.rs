@@ -200,8 +200,8 @@ impl Bus {
     /// How to open the devices with the bit rates that these channels have; the others as before.
     pub(crate) fn at_rates(&self, channels: &[ChannelState]) -> ChannelOptions {
         let mut open = self.device.open.clone();
-        for of in channels {
-            let rate = RequestedRate { channel: Some(of.channel), bitrate_bps: Some(of.bitrate) };
+        for of in channels.iter().filter(|of| of.bitrate.is_some()) {
+            let rate = RequestedRate { channel: Some(of.channel), bitrate_bps: of.bitrate };
             open.timing.set_bit_rate_of(rate);
         }
         open
@@ -395,7 +395,7 @@ impl Bus {
                 let of = &status.channels[channel.index()];
                 channels.push(ChannelState {
                     channel: channel_number(board, channel),
-                    bitrate: config.timing.bitrate_bps(clock_hz),
+                    bitrate: config.timing.known_bitrate_bps(clock_hz),
                     state: of.state.name(),
                     counters: (of.tec, of.rec),
                 });

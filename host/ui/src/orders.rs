@@ -16,6 +16,7 @@ use crate::bus::Bus;
 use crate::device::Device;
 use crate::request::{Only, Request};
 use crate::shared::Order;
+use crate::state::ChannelState;
 use crate::visits::Visit;
 use crate::{recorder, sender};
 
@@ -170,8 +171,10 @@ impl Bus {
         let listens = if state.is_normal { ", and all channels only listen now" } else { "" };
         let now = self.shared.state().channels.into_iter().find(|open| open.channel == channel);
         match now {
-            Some(now) => self.note(format!("channel {channel} is at {} bit/s{listens}", now.bitrate)),
-            None => self.note(format!("channel {channel} is away{listens}")),
+            Some(ChannelState { bitrate: Some(bitrate_bps), .. }) => {
+                self.note(format!("channel {channel} is at {bitrate_bps} bit/s{listens}"));
+            }
+            _ => self.note(format!("channel {channel} is away{listens}")),
         }
         Ok(())
     }

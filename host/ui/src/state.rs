@@ -52,8 +52,8 @@ pub struct DeviceState {
 pub struct ChannelState {
     /// From 1.
     pub channel: u8,
-    /// Bit/s.
-    pub bitrate: u32,
+    /// Bit/s; none where somebody else has set it and nobody here knows.
+    pub bitrate: Option<u32>,
     /// The controller's state, by its name: `active`, `warning`, `passive`, `bus-off`.
     pub state: &'static str,
     /// Transmit and receive error counters.

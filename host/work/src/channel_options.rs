@@ -8,6 +8,7 @@ use cantap::autobaud::{Limits, Outcome};
 use cantap::device::channel_number;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
+use cantap::wire::BitTiming;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode, capability};
 use cantap_address::OpenDevice;
 use cantap_trace::filter::Filter;
@@ -242,7 +243,12 @@ impl ChannelOptions {
         let number = self.number(channel);
         if !bit_rate_search::is_possible(device) {
             bail!(
-                "channel {number}: this device cannot find a bit rate by listening; give it with -b RATE, such as -b 500k"
+                "channel {number}: this device cannot find a bit rate by listening; give it with -b RATE, such as -b 500k{}",
+                if device.hello().capabilities & capability::NO_BIT_RATE == 0 {
+                    ""
+                } else {
+                    ", or leave out -b"
+                }
             );
         }
         reporter.note(format!("channel {number}: listening for its bit rate"));
@@ -285,10 +291,10 @@ impl ChannelOptions {
             None => match (device.defaults(channel)?, device.bitrate_of_bus(channel)) {
                 (Some(saved), _) => (saved.config, Some(saved)),
                 (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
-                (None, None) if device.hello().capabilities & capability::NO_BIT_RATE != 0 => bail!(
-                    "the bit rate of channel {} is set elsewhere, and this device does not say it: give it with -b RATE, such as -b 500k",
-                    self.number(channel)
-                ),
+                // Nothing but figures needs it.
+                (None, None) if device.hello().capabilities & capability::NO_BIT_RATE != 0 => {
+                    (ChannelConfig::listen_only(BitTiming::UNKNOWN), None)
+                }
                 (None, None) => bail!(
                     "no bit rate for channel {}: give one with -b RATE, have it found with -b auto, or save one \
                      with `cantap defaults save`",
@@ -296,8 +302,8 @@ impl ChannelOptions {
                 ),
             },
         };
-        let bitrate_bps = base.timing.bitrate_bps(device.hello().can_clock_hz);
-        if let Some(reason) = device.rate_conflict(bitrate_bps) {
+        let bitrate_bps = base.timing.known_bitrate_bps(device.hello().can_clock_hz);
+        if let Some(reason) = bitrate_bps.and_then(|bitrate_bps| device.rate_conflict(bitrate_bps)) {
             bail!("{reason}");
         }
         let config = ChannelConfig {
@@ -322,5 +328,8 @@ pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
         Mode::Loopback => "in loopback",
         Mode::SilentLoopback => "in silent loopback",
     };
-    format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
+    match config.timing.known_bitrate_bps(can_clock_hz) {
+        Some(bitrate_bps) => format!("{bitrate_bps} bit/s, {mode}"),
+        None => format!("bit rate not known, {mode}"),
+    }
 }

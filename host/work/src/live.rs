@@ -104,10 +104,12 @@ impl LiveRecords {
         &self.lines
     }
 
-    /// The bit rates of the open channels, by number, in bit/s.
+    /// The bit rates of the open channels that are known, by number, in bit/s.
     pub fn bit_rates(&self) -> Vec<(u8, u32)> {
-        let opened = self.opened();
-        opened.map(|(number, config, clock_hz)| (number, config.timing.bitrate_bps(clock_hz))).collect()
+        let known = |(number, config, clock_hz): (u8, ChannelConfig, u32)| {
+            Some((number, config.timing.known_bitrate_bps(clock_hz)?))
+        };
+        self.opened().filter_map(known).collect()
     }
 
     /// The bit rates of their data phases that are known, by number, in bit/s.
@@ -146,7 +148,7 @@ impl LiveRecords {
             let how = channel_options::description(&config, clock_hz);
             ChannelInfo {
                 channel: number,
-                bitrate_bps: Some(config.timing.bitrate_bps(clock_hz)),
+                bitrate_bps: config.timing.known_bitrate_bps(clock_hz),
                 description: format!("channel {} of {address}, {how}", channel.number()),
             }
         };

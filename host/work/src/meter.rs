@@ -29,7 +29,7 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// Nothing has been delivered yet, for a channel that streams everything.
+    /// Nothing has been delivered yet, for a channel that streams everything. A bit rate of 0 is not known.
     pub fn new(bitrate_bps: u32) -> Self {
         Self {
             frames: 0,
@@ -164,6 +164,8 @@ impl Meter {
         } else if self.without_data > 0 {
             // Stuff bits depend on them.
             Some("frames come without data")
+        } else if self.bitrate_bps == 0 {
+            Some("the bit rate is not known: give it with -b")
         } else if self.of_unknown_length > 0 {
             Some("frames switch to a data bit rate that is not known")
         } else {
@@ -221,6 +223,14 @@ mod tests {
         // A channel without data does not lack them.
         let without = meter(|config| config.omit_data = true, &data[1..]);
         assert!(without.without_data == 0 && without.bus_load_pct() > Some(0.0));
+    }
+
+    #[test]
+    fn without_a_bit_rate_the_rest_is_known() {
+        let meter = meter(|config| config.timing = BitTiming::UNKNOWN, &["123#0011", "123#0011"]);
+        let reason = "the bit rate is not known: give it with -b";
+        assert_eq!((meter.bus_load_pct(), meter.no_bus_load_because()), (None, Some(reason)));
+        assert_eq!((meter.frames(), meter.frames_per_s()), (2, Some(1000.0)));
     }
 
     #[test]

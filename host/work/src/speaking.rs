@@ -49,7 +49,8 @@ struct Traffic {
 pub struct Speaking<'d> {
     device: &'d OpenDevice,
     channel: Channel,
-    bitrate_bps: u32,
+    /// If known.
+    bitrate_bps: Option<u32>,
     records: Records,
     stream: Stream<'d>,
     sending: Sending<'d>,
@@ -85,7 +86,7 @@ impl<'d> Speaking<'d> {
         Self {
             device,
             channel,
-            bitrate_bps: open.map_or(1, |(_, config)| config.timing.bitrate_bps(clock_hz)),
+            bitrate_bps: open.and_then(|(_, config)| config.timing.known_bitrate_bps(clock_hz)),
             records: device.records(),
             stream: Stream::new(device),
             sending: Sending::fed(device, recovery, None),
@@ -360,7 +361,10 @@ impl<'d> Speaking<'d> {
     pub fn circumstances(&self) -> String {
         let Traffic { since, own, frames, bits, is_bound, lost, errors } = self.traffic;
         let seconds = since.map_or(0.0, |since| since.elapsed().as_secs_f64()).max(1e-3);
-        let load_pct = (bits as f64 / (f64::from(self.bitrate_bps) * seconds) * 100.0).min(100.0);
+        let load = self.bitrate_bps.map_or_else(String::new, |bitrate_bps| {
+            let load_pct = (bits as f64 / (f64::from(bitrate_bps) * seconds) * 100.0).min(100.0);
+            format!(" (load {}{load_pct:.0} %)", if is_bound { "at least " } else { "" })
+        });
         let count = |number, noun| counted(usize::try_from(number).unwrap_or(usize::MAX), noun);
         let mut text = match own {
             0 => "nothing was sent".to_owned(),
@@ -368,12 +372,7 @@ impl<'d> Speaking<'d> {
         };
         let _ = match frames {
             0 => write!(text, "; no other frame was heard in {seconds:.1} s"),
-            frames => write!(
-                text,
-                "; {} of others in {seconds:.1} s (load {}{load_pct:.0} %)",
-                count(frames, "frame"),
-                if is_bound { "at least " } else { "" }
-            ),
+            frames => write!(text, "; {} of others in {seconds:.1} s{load}", count(frames, "frame")),
         };
         if errors > 0 {
             let _ = write!(text, "; {}", count(errors, "bus error"));

@@ -137,7 +137,7 @@ impl Device {
         py: Python<'_>,
         number: OfDevice,
         options: ChannelOptions,
-    ) -> PyResult<(u32, Option<String>)> {
+    ) -> PyResult<(Option<u32>, Option<String>)> {
         let channel = number.0;
         let session = self.session()?;
         let opened = py.detach(|| -> Result<_, Error> {
@@ -166,6 +166,8 @@ impl Device {
                 request.resolve(clock_hz).map_err(Error::argument)?
             } else if let Some(saved) = device.defaults(channel)? {
                 saved.config.timing
+            } else if device.hello().capabilities & capability::NO_BIT_RATE != 0 {
+                BitTiming::UNKNOWN
             } else {
                 return Err(Error::argument(format!(
                     "nothing is saved on the device for channel {}; give bitrate=, such as 500_000",
@@ -179,7 +181,7 @@ impl Device {
                 ..ChannelConfig::listen_only(timing)
             };
             let remainder = session.open_channel(channel, config, &filters)?;
-            Ok((timing.bitrate_bps(clock_hz), remainder.map(|remainder| remainder.to_string())))
+            Ok((timing.known_bitrate_bps(clock_hz), remainder.map(|remainder| remainder.to_string())))
         })?;
         Ok(opened)
     }
@@ -210,7 +212,7 @@ impl Device {
         let open = PyDict::new(py);
         for (channel, config) in device.open_channels() {
             let about = PyDict::new(py);
-            about.set_item("bitrate", config.timing.bitrate_bps(device.hello().can_clock_hz))?;
+            about.set_item("bitrate", config.timing.known_bitrate_bps(device.hello().can_clock_hz))?;
             about.set_item("mode", config.mode.name())?;
             open.set_item(channel.number(), about)?;
         }

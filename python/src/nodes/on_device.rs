@@ -11,7 +11,8 @@ use cantap_address::{Address, OpenDevice};
 use cantap_scripts::{Live, LiveError, LiveRun, Message, Script};
 use cantap_signals::Decoder;
 use cantap_trace::Frame;
-use cantap_wire::Channel;
+use cantap_wire::message::{ChannelConfig, Mode, capability};
+use cantap_wire::{BitTiming, Channel};
 
 use crate::error::Error;
 
@@ -50,10 +51,14 @@ impl OnDevice {
         decoder: Arc<Decoder>,
     ) -> Result<Self, Error> {
         let device = address.parse::<Address>().map_err(Error::argument)?.open()?;
-        let Some(bitrate_bps) = bitrate_bps.or_else(|| device.bitrate_of_bus(channel_of)) else {
+        if let Some(bitrate_bps) = bitrate_bps.or_else(|| device.bitrate_of_bus(channel_of)) {
+            device.join(channel_of, bitrate_bps)?;
+        } else if device.hello().capabilities & capability::NO_BIT_RATE != 0 {
+            let unknown = ChannelConfig::listen_only(BitTiming::UNKNOWN);
+            device.open_channel(channel_of, Some(ChannelConfig { mode: Mode::Normal, ..unknown }))?;
+        } else {
             return Err(Error::argument(format!("'{address}' has no bit rate that is known; give one")));
-        };
-        device.join(channel_of, bitrate_bps)?;
+        }
         let (orders, received) = channel();
         let (passed, records) = channel();
         let body = move || {

@@ -6,7 +6,7 @@ use std::time::Duration;
 use cantap::autobaud::{Limits, Outcome, Progress};
 
 use cantap::device::channel_number;
-use cantap::wire::message::Mode;
+use cantap::wire::message::{Mode, capability};
 
 use super::super::model::SourceState;
 use super::super::plan::Plan;
@@ -107,6 +107,9 @@ impl Source<'_> {
         }
         plan.addresses.iter().enumerate().any(|(board, address)| {
             let Ok(device) = address.open() else { return false };
+            if device.hello().capabilities & capability::NO_BIT_RATE != 0 {
+                return false;
+            }
             let lacks = |channel| {
                 device.bitrate_of_bus(channel).is_none()
                     && device.defaults(channel).is_ok_and(|saved| saved.is_none())

@@ -269,8 +269,9 @@ impl Source<'_> {
         let is_car = hello.board == cantap_virtual::car::BOARD;
         model.met_car |= is_car;
         model.vehicle.is_there |= is_car;
-        let rates =
-            opened.iter().map(|(number, config, clock_hz)| (*number, config.timing.bitrate_bps(*clock_hz)));
+        let rates = opened.iter().filter_map(|(number, config, clock_hz)| {
+            Some((*number, config.timing.known_bitrate_bps(*clock_hz)?))
+        });
         let rates: Vec<_> = rates.collect();
         let lacks =
             |lacks: fn(&ChannelConfig) -> bool| opened.iter().filter(move |(_, config, _)| lacks(config));

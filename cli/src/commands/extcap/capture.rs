@@ -190,7 +190,7 @@ impl Capture<'_> {
         for (_, device) in self.live.lines().devices() {
             let clock_hz = device.hello().can_clock_hz;
             for (channel, config) in device.open_channels() {
-                let bitrate_bps = config.timing.bitrate_bps(clock_hz);
+                let Some(bitrate_bps) = config.timing.known_bitrate_bps(clock_hz) else { continue };
                 self.wanted.toolbar.screen.show_channel(channel, bitrate_bps, config.mode);
                 self.traffic.set_bit_rate(channel.number(), bitrate_bps);
             }

@@ -19,7 +19,7 @@ pub struct Filled {
 }
 
 impl Filled {
-    /// Nothing was sent yet.
+    /// Nothing was sent yet. A bit rate of 0 is not known.
     pub const fn new(bitrates_bps: [u32; CHANNELS], data_bitrates_bps: [Option<u32>; CHANNELS]) -> Self {
         Self {
             bitrates_bps,
@@ -63,7 +63,7 @@ impl Filled {
             let (first, last) = self.span_ticks[index].filter(|(first, last)| first < last)?;
             let seconds = (last - first) as f64 / f64::from(tick_hz);
             let load_pct = self.bits[index] * 100.0 / (f64::from(self.bitrates_bps[index]) * seconds);
-            let load_pct = (!self.is_unknown[index]).then_some(load_pct);
+            let load_pct = (!self.is_unknown[index] && self.bitrates_bps[index] > 0).then_some(load_pct);
             Some((channel, self.frames[index] as f64 / seconds, load_pct))
         })
     }
@@ -72,7 +72,7 @@ impl Filled {
     pub fn tell(&self, tick_hz: u32) {
         for (channel, frames_per_s, load_pct) in self.rates(tick_hz) {
             let load = load_pct.map_or_else(
-                || "unknown, as the data bit rate is".to_owned(),
+                || "unknown, as the bit rate is".to_owned(),
                 |load_pct| format!("{load_pct:.1} %"),
             );
             eprintln!("cantap: channel {}: {frames_per_s:.0} frames/s, bus load {load}", channel.number());

@@ -192,10 +192,13 @@ impl Decoder {
             return Ok(OnChannel::Event(error_frame(rest)));
         }
         let Some((raw, extended)) = self.identifier(id) else { return others::on_channel(id) };
+        let after_id = rest;
         let (word, rest) = text::word(rest);
-        let direction = match direction(word) {
-            Some(direction) => direction,
+        let (direction, rest) = match direction(word) {
+            Some(direction) => (direction, rest),
             None if word == b"TxRq" => return Ok(OnChannel::Request),
+            // As scripts write it that leave the direction out.
+            None if matches!(word, b"d" | b"r") => (Direction::Rx, after_id),
             None => {
                 let marker = others::like_a_frame(rest).map(OnChannel::LeftOut);
                 return marker.ok_or_else(|| Fault::malformed("'Rx' or 'Tx' after the identifier", word));
@@ -343,6 +346,7 @@ impl Decoder {
         Ok(OnChannel::Event(TraceEvent::Frame { frame, direction, late: false }))
     }
 
+    /// An identifier, and whether it has 29 bits: it is followed by x, or so large that it can be no other, where a script left the x out.
     #[inline]
     fn identifier(&self, word: &[u8]) -> Option<(u32, bool)> {
         let (digits, extended) = match word {
@@ -354,7 +358,7 @@ impl Decoder {
             None if self.decimal => u32::try_from(text::decimal(digits)?).ok()?,
             None => text::hex(digits)?,
         };
-        Some((raw, extended))
+        Some((raw, extended || raw > 0x7FF && digits.len() > 3))
     }
 
     #[inline]

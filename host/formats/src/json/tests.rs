@@ -49,6 +49,20 @@ fn objects_of_different_programs_are_read_whole() {
             "{\"topic\":\"can/rx\",\"payload\":{\"timestamp\":1.25,\"id\":\"7DF\",\"dlc\":2,\"data\":\"0201\"}}\n",
             "(1.250000) can0 7DF#0201\n",
         ),
+        // `tshark -T ek`: a line about the index before each frame, the time twice, decimal identifiers in texts.
+        (
+            "{\"index\":{\"_index\":\"packets-2023-11-14\",\"_type\":\"doc\"}}\n\
+             {\"timestamp\":\"1700000000500\",\"layers\":{\"frame\":{\"frame_frame_time_epoch\":\"1700000000.500001000\",\"frame_frame_len\":\"10\"},\
+             \"can\":{\"can_can_id\":\"291\",\"can_can_flags_xtd\":false,\"can_can_flags_rtr\":false,\"can_can_flags_err\":false,\"can_can_len\":\"2\"},\
+             \"data\":{\"data_data_data\":\"11:22\",\"data_data_len\":\"2\"}}}\n\
+             {\"index\":{\"_index\":\"packets-2023-11-14\",\"_type\":\"doc\"}}\n\
+             {\"timestamp\":\"1700000000600\",\"layers\":{\"frame\":{\"frame_frame_time_epoch\":\"1700000000.600000000\",\"frame_frame_len\":\"9\"},\
+             \"can\":{\"can_can_id\":\"419361278\",\"can_can_flags_xtd\":true,\"can_can_flags_rtr\":false,\"can_can_flags_err\":false,\"can_can_len\":\"1\"},\
+             \"data\":{\"data_data_data\":\"07\",\"data_data_len\":\"1\"}}}\n\
+             {\"timestamp\":\"1700000000700\",\"layers\":{\"frame\":{\"frame_frame_time_epoch\":\"1700000000.700000000\",\"frame_frame_len\":\"8\"},\
+             \"can\":{\"can_can_id\":\"2015\",\"can_can_flags_xtd\":false,\"can_can_flags_rtr\":false,\"can_can_flags_err\":false,\"can_can_len\":\"0\"}}}\n",
+            "(1700000000.500001) can0 123#1122\n(1700000000.600000) can0 18FEF1FE#07\n(1700000000.700000) can0 7DF#\n",
+        ),
         // Our own, with CAN FD.
         (
             "{\"time_s\":1.5,\"channel\":2,\"match\":true,\"id\":\"123\",\"frame\":\"123##10102\"}\n{\"summary\":{\"found\":1}}\n",

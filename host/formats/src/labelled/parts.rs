@@ -209,6 +209,13 @@ pub(super) fn tokens(value: &[u8]) -> impl Iterator<Item = &[u8]> {
     value.split(is_between).filter(|word| !word.is_empty())
 }
 
+/// The list in brackets that a value begins with, as Python prints one.
+pub(super) fn list(value: &[u8]) -> Option<&[u8]> {
+    let value = value.trim_ascii_start();
+    let end = memchr::memchr(b']', value).filter(|_| value.starts_with(b"["))?;
+    Some(&value[..=end]).filter(|list| list.contains(&b','))
+}
+
 fn byte(word: &[u8], is_decimal: bool) -> Option<u8> {
     let number = match text::after_0x(word) {
         None if is_decimal => text::number(word, true),

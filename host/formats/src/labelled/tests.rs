@@ -136,3 +136,13 @@ proptest! {
         tests::read(Format::Labelled, lines.join("\n"));
     }
 }
+
+/// `print(f"id: {hex(msg.arbitration_id)} data: {list(msg.data)}")`.
+#[test]
+fn lists_that_python_prints_are_decimal() {
+    let (log, issues) = as_log("id: 0x123 data: [17, 34]\nid: 0x124 data: [5]\nid: 0x125 data: []\n");
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(0.000000) can0 123#1122\n(0.000000) can0 124#05\n(0.000000) can0 125#\n");
+    // With leading zeros they are not.
+    assert_eq!(as_log("id: 0x123 data: [17, 04]\n").0, "(0.000000) can0 123#1704\n");
+}

@@ -77,6 +77,34 @@ pub(super) fn is_list(cell: &[u8]) -> bool {
     })
 }
 
+/// Whether a cell is in brackets.
+pub(super) fn is_bracketed(cell: &[u8]) -> bool {
+    matches!(cell, [b'[', .., b']'] | [b'(', .., b')'])
+}
+
+/// Whether the numbers in these cells in brackets are decimal: Python separates those of a list with commas, numpy those of an array with blanks,
+/// and neither writes leading zeros. A single number in each is one of Python's.
+pub(crate) fn lists_are_decimal(cells: &[&[u8]]) -> bool {
+    let words = |cell: &'_ [u8]| {
+        let inner = cell[1..cell.len() - 1].to_vec();
+        inner
+            .split(|byte| matches!(byte, b' ' | b','))
+            .filter(|word| !word.is_empty())
+            .map(<[u8]>::to_vec)
+            .collect::<Vec<_>>()
+    };
+    let all: Vec<_> = cells.iter().map(|cell| words(cell)).collect();
+    let is_plain =
+        |word: &Vec<u8>| text::decimal(word).is_some() && (word.len() == 1 || !word.starts_with(b"0"));
+    if !all.iter().flatten().all(is_plain) {
+        return false;
+    }
+    let shows = |word: &Vec<u8>| matches!(word.len(), 1 | 3);
+    cells.iter().any(|cell| is_list(cell))
+        || all.iter().flatten().any(shows)
+        || !all.is_empty() && all.iter().all(|words| words.len() < 2)
+}
+
 /// What Python prints of bytes, between its quotation marks: of `b'\xca\x18%'` or `bytearray(b'\xca\x18%')`, what an `str` of a message's data is.
 fn python_bytes(cell: &[u8]) -> Option<&[u8]> {
     let inner = cell.strip_prefix(b"bytearray(").and_then(|cell| cell.strip_suffix(b")")).unwrap_or(cell);

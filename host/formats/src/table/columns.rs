@@ -190,17 +190,17 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         let (role, form) = role_of(field)?;
         return Some((role, role.takes(Form::Decimal).then_some(Form::Decimal).or(form)));
     }
-    // As `tshark -T fields` and `-T json` name them, whose identifiers are decimal.
+    // As `tshark -T fields` and `-T json` name them, and `-T ek`, whose identifiers are decimal.
     match name {
-        b"frame.time_epoch" | b"frame.time_relative" => {
+        b"frame.time_epoch" | b"frame.time_relative" | b"frame_frame_time_epoch" => {
             return Some((Role::Time, Some(Form::Unit(1_000_000_000))));
         }
-        b"can.id" => return Some((Role::Id, Some(Form::Decimal))),
-        b"can.len" => return Some((Role::Dlc, None)),
-        b"data.data" => return Some((Role::Data, Some(Form::Hex))),
-        b"can.flags.xtd" => return Some((Role::Extended, None)),
-        b"can.flags.rtr" => return Some((Role::Remote, None)),
-        b"can.flags.err" => return Some((Role::Error, None)),
+        b"can.id" | b"can_can_id" => return Some((Role::Id, Some(Form::Decimal))),
+        b"can.len" | b"can_can_len" => return Some((Role::Dlc, None)),
+        b"data.data" | b"data_data_data" => return Some((Role::Data, Some(Form::Hex))),
+        b"can.flags.xtd" | b"can_can_flags_xtd" => return Some((Role::Extended, None)),
+        b"can.flags.rtr" | b"can_can_flags_rtr" => return Some((Role::Remote, None)),
+        b"can.flags.err" | b"can_can_flags_err" => return Some((Role::Error, None)),
         _ => {}
     }
     let stem = plain.trim_end_matches(|last: char| last.is_ascii_digit());
@@ -217,6 +217,8 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         "starttime",
         "time",
         "ts",
+        "zeitstempel",
+        "zeit",
     ] {
         if let Some(unit) = plain.strip_prefix(prefix) {
             let unit = match unit {
@@ -247,16 +249,18 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         "id" | "canid" | "arbitrationid" | "arbid" | "identifier" | "canidentifier" | "addr" | "address"
         | "messageid" | "msgid" | "frameid" | "idh" => Role::Id,
         "dlc" | "dl" | "len" | "length" | "datalength" | "datalen" | "candlc" | "control"
-        | "messagelength" => Role::Dlc,
-        "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" => Role::Data,
+        | "messagelength" | "laenge" | "lnge" | "datenlaenge" | "datenlnge" => Role::Dlc,
+        "data" | "payload" | "databytes" | "datafield" | "candata" | "rawdata" | "daten" => Role::Data,
         "bus" | "busid" | "busnumber" => return Some((Role::Channel, Some(Form::FromZero))),
-        "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" => Role::Channel,
+        "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" | "kanal" => {
+            Role::Channel
+        }
         "extended" | "ide" | "ext" | "isextended" | "isextendedid" | "extendedid" | "idtype" => {
             Role::Extended
         }
         "remote" | "remoteedlbrsesi" | "rtr" | "isremote" | "isrtr" | "isremoteframe" => Role::Remote,
         "error" | "er" | "iserror" | "errorframe" | "iserrorframe" => Role::Error,
-        "dir" | "direction" | "rxtx" | "txrx" | "tx" => Role::Direction,
+        "dir" | "direction" | "rxtx" | "txrx" | "tx" | "richtung" => Role::Direction,
         _ => return None,
     };
     Some((role, radix.filter(|form| role.takes(*form))))

@@ -4,6 +4,7 @@ use cantap_trace::counted;
 
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
 use super::columns::{Column, Columns, Form, ROLES, Role, kind_of, role_of};
 use super::columns::{TypedColumn, TypedForm};
 
@@ -61,6 +62,8 @@ pub(super) struct Layout {
     pub has_others: bool,
     /// Whether it is Cabana's: then buses are numbered as the panda numbers them.
     pub is_cabana: bool,
+    /// Whether it is python-can's, saved anew with other separators: its bytes are in base64.
+    pub is_base64: bool,
 }
 
 impl Layout {
@@ -96,6 +99,7 @@ impl Layout {
             kinds,
             has_others: false,
             is_cabana: false,
+            is_base64: false,
         }
     }
 
@@ -129,6 +133,8 @@ impl Layout {
             layout.places[Role::Data as usize] = Some(Place { at, form: Some(Form::Hex) });
             layout.has_others = names.len() > layout.places.iter().flatten().count() + layout.kinds.len();
         }
+        layout.is_base64 = names
+            == [&b"timestamp"[..], b"arbitration_id", b"extended", b"remote", b"error", b"dlc", b"data"];
         layout.is_cabana = names == [&b"time"[..], b"addr", b"bus", b"data"];
         let has = |role| layout.place(role).is_some();
         let blanks_too = separator != Separator::Blanks || has(Role::Time);
@@ -248,12 +254,13 @@ impl Layout {
             _ => (cells, None, 0),
         };
         let [time, id, len, data @ ..] = cells else { return None };
-        let time_ns = text::time(time, NS_PER_S, b'.').filter(|_| time.contains(&b'.'));
+        let is_clock = is_clock(time);
+        let is_time = is_clock || text::time(time, NS_PER_S, b'.').is_some() && time.contains(&b'.');
         let is_id = match text::after_0x(id) {
             Some(digits) => matches!(digits.len(), 1..=8) && text::hex(digits).is_some(),
             None => matches!(id.len(), 3 | 4 | 8) && text::hex(id).is_some(),
         };
-        let len = text::decimal(len).filter(|len| *len <= 8 && is_id && time_ns.is_some())? as usize;
+        let len = text::decimal(len).filter(|len| *len <= 8 && is_id && is_time)? as usize;
         let is_byte = |cell: &&[u8]| cell.len() == 2 && text::hex(cell).is_some();
         let one_each = data.iter().take(len).take_while(|cell| is_byte(cell)).count() == len;
         let in_one = len > 1 && data.first().is_some_and(|cell| byte_count(cell) == Some(len));
@@ -262,7 +269,8 @@ impl Layout {
         }
         let mut places = [None; ROLES.len()];
         let hex = Some(Form::Hex);
-        places[Role::Time as usize] = Some(Place { at: 0, form: Some(Form::Unit(NS_PER_S)) });
+        let form = (!is_clock).then_some(Form::Unit(NS_PER_S));
+        places[Role::Time as usize] = Some(Place { at: 0, form });
         if let Some(role) = before {
             places[role as usize] = Some(Place { at: 1, form: None });
         }
@@ -311,6 +319,13 @@ impl Layout {
     }
 }
 
+/// Whether a cell is a time of day, `12:34:56.789`.
+fn is_clock(cell: &[u8]) -> bool {
+    memchr::memchr_iter(b':', cell).count() == 2
+        && cell.first().is_some_and(u8::is_ascii_digit)
+        && super::date(cell, &Zone::default()).is_some()
+}
+
 /// Whether a cell is a day, `T`, and a time of day in digits: `31T135012345`.
 fn is_stamp(cell: &[u8]) -> bool {
     let Some(at) = memchr::memchr(b'T', cell) else { return false };
@@ -356,8 +371,21 @@ pub(super) fn proposal_of_row(line: &[u8]) -> Option<String> {
     let bytes = cells.iter().rev().take_while(is_byte).count();
     let before = &cells[..cells.len() - bytes];
     let is_id = |cell: &&[u8]| matches!(bare(cell).len(), 3 | 4 | 8) && text::hex(&bare(cell)).is_some();
+    // All bytes in a cell, with something between them.
+    let in_one = bytes == 0
+        && cells
+            .last()
+            .is_some_and(|cell| cell.len() > 4 && cell.contains(&b' ') && byte_count(cell).is_some());
+    if in_one {
+        let id = before[..before.len() - 1].iter().rposition(is_id)?;
+        return Some(format!("id={}:hex,data={}:hex", id + 1, cells.len()));
+    }
     let id = before.iter().rposition(is_id).filter(|_| bytes > 0)?;
-    let is_time = |cell: &&[u8]| cell.contains(&b'.') && text::time(cell, NS_PER_S, b'.').is_some();
+    let is_time = |cell: &&[u8]| {
+        is_clock(cell)
+            || cell.iter().any(|byte| matches!(byte, b'.' | b','))
+                && text::time_of_any_mark(cell, NS_PER_S).is_some()
+    };
     let time = before[..id].iter().position(is_time).map_or(String::new(), |at| format!("time={},", at + 1));
     let is_len =
         before.len() > id + 1 && before.last().is_some_and(|len| text::decimal(len) == Some(bytes as u64));

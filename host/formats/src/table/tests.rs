@@ -403,6 +403,7 @@ fn rows_without_names_get_columns_by_their_numbers_to_try() {
         ("ATMA\r\n18DAF110 8 03 41 0C 1A 00 00 00 00", Some("id=1:hex,dlc=2,bytes=3:hex")),
         ("1.5 can0 Rx 123 AA", Some("time=1,id=4:hex,bytes=5:hex")),
         ("415,FE,15", Some("id=1:hex,bytes=2:hex")),
+        ("0x123,11 22 33", Some("id=1:hex,data=2:hex")),
         ("a text of words", None),
         ("2024-01-01 12:00:00 started", None),
     ] {
@@ -432,4 +433,46 @@ fn what_tshark_prints_is_read_with_decimal_identifiers() {
     let (log, issues) = as_log(&(0..28).map(row).collect::<String>());
     assert_eq!(issues, Vec::<String>::new());
     assert!(log.starts_with("(1478198376.000000) can0 100#00\n(1478198376.000001) can0 150#01\n"), "{log}");
+}
+
+/// What Python prints of a list of one byte, and numpy of an array, is decimal as the longer ones are.
+#[test]
+fn lists_of_one_byte_are_decimal_as_the_others_are() {
+    let (log, issues) = as_log(
+        "timestamp,arbitration_id,data\n1.5,0x123,[68]\n1.6,0x123,\"[1, 2]\"\n1.7,0x123,[148]\n1.8,0x123,[]\n",
+    );
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(
+        log,
+        "(1.500000) can0 123#44\n(1.600000) can0 123#0102\n(1.700000) can0 123#94\n(1.800000) can0 123#\n"
+    );
+    let (log, _) = as_log("timestamp,arbitration_id,data\n1.5,0x123,[17 34]\n1.6,0x123,[  1 255]\n");
+    assert_eq!(log, "(1.500000) can0 123#1122\n(1.600000) can0 123#01FF\n");
+    let (log, _) = as_log("timestamp,arbitration_id,data\n1.5,0x123,[17 34]\n1.6,0x123,[0A 10]\n");
+    assert_eq!(log, "(1.500000) can0 123#1734\n(1.600000) can0 123#0A10\n");
+}
+
+/// As a spreadsheet saves python-can's table.
+#[test]
+fn python_can_s_table_with_semicolons_has_its_bytes_in_base64() {
+    let (log, issues) = as_log(
+        "timestamp;arbitration_id;extended;remote;error;dlc;data\n1.5;0x123;0;0;0;3;AAAA\n1.6;0x18fef100;1;0;0;1;RA==\n1.7;0x123;0;1;0;2;\n",
+    );
+    assert_eq!(issues, Vec::<String>::new());
+    assert_eq!(log, "(1.500000) can0 123#000000\n(1.600000) can0 18FEF100#44\n(1.700000) can0 123#R2\n");
+}
+
+#[test]
+fn a_clock_without_a_date_goes_on_behind_midnight() {
+    let wanted = "(86399.500000) can0 123#1122\n(86400.250000) can0 123#3344\n";
+    for file in [
+        "23:59:59.500 Rx 0x123 2 11 22\n00:00:00.250 Rx 0x123 2 33 44\n",
+        "Time,ID,Data\n23:59:59.500,123,11 22\n00:00:00.250,123,33 44\n",
+        // A German spreadsheet's, with the line that says what separates its cells.
+        "sep=;\nZeit;ID (hex);L\u{e4}nge;Daten\n23:59:59,500;123;2;11 22\n00:00:00,250;123;2;33 44\n",
+    ] {
+        let (log, issues) = as_log(file);
+        assert_eq!((log.as_str(), issues), (wanted, vec![]), "{file}");
+        assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Table), "{file}");
+    }
 }

@@ -111,6 +111,17 @@ pub(crate) fn date(cell: &[u8], zone: &Zone) -> Option<i64> {
     valid.then(|| (hour * 3600 + minute * 60) as i64 * NS_PER_S + second_ns)
 }
 
+/// A time, behind the last one: a clock without a date begins again at midnight, and its days go on.
+pub(crate) fn going_on(time_ns: i64, last_ns: Option<i64>) -> i64 {
+    const HALF_NS: i64 = NS_PER_DAY / 2;
+    let last = last_ns.unwrap_or(0);
+    let of_day = (0..NS_PER_DAY).contains(&time_ns);
+    let day_ns = if of_day { last - last.rem_euclid(NS_PER_DAY) } else { 0 };
+    let day_ns = if day_ns < 3650 * NS_PER_DAY { day_ns } else { 0 };
+    let is_next = of_day && last_ns.is_some_and(|last_ns| time_ns + day_ns + HALF_NS < last_ns);
+    time_ns + day_ns + if is_next { NS_PER_DAY } else { 0 }
+}
+
 /// The year, the month and the day of a file: what its stamps leave out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct FileDate {

@@ -260,6 +260,22 @@ fn samples() -> Vec<(Format, Vec<u8>)> {
              15,320000\t2\t00000005\t1B000067\t2\t67 00\t00000000\tg \t\r",
         ),
         text(
+            Format::TraceWindow,
+            "0.010640\tCAN 1\t123\tEngine\tCAN Frame\tRx\t2\t2\t11 22\n0.020000\tCAN 2\t18FEF100x\t\tCAN Frame\tTx\t8\t8\t01 02 03 04 05 06 07 08\n\
+             0.030000\tCAN 1\t7DF\t\tRemote Frame\tRx\t0\t0\t\n0.040000\tCAN 1\tError Frame\n  EngSpeed\t1200\n",
+        ),
+        text(
+            Format::EspHome,
+            "[12:00:01][D][canbus:070]: received can message (#1) std can_id=0x305 size=1\n[12:00:01][V][canbus:077]:   can_message.data[0]=0a\n\
+             [12:00:02][D][canbus:067]: received can message (#2) extended can_id=0x18fef100 size=0\n",
+        ),
+        text(
+            Format::Sigrok,
+            "can-1: Start of frame\ncan-1: Identifier: 291 (0x123)\ncan-1: Data length code: 1\ncan-1: Data byte 0: 0x11\ncan-1: End of frame\n\
+             can-2: Start of frame\ncan-2: Full Identifier: 418644160 (0x18f400c0)\ncan-2: Remote transmission request: remote frame\n\
+             can-2: Data length code: 4\ncan-2: End of frame\n",
+        ),
+        text(
             Format::Saleae,
             "name,type,start_time,duration,identifier,num_data_bytes,data,crc,ack,remote_frame,extended\n\
              CAN,identifier_field,-0.5,1e-05,0x123,,,,,,\nCAN,control_field,0,1e-05,,1,,,,,\nCAN,data_field,0,1e-05,,,0x11,,,,\n\

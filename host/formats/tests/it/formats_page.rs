@@ -52,6 +52,11 @@ fn row(format: Format) -> String {
             }
             Format::Busmaster => ["0.1 ms, local", "yes | yes | yes | – | – | – | –"],
             Format::Crtd => ["as written", "yes | yes | – | – | – | – | –"],
+            Format::EspHome => ["1 s or 1 ms, local", "– | yes | yes | – | – | – | –"],
+            Format::Sigrok => ["none", "yes | – | yes | yes | – | – | –"],
+            Format::TraceWindow => {
+                ["as written, no date", "yes | yes | yes | without flags | that there was one | – | –"]
+            }
             Format::Kvaser => ["as written, no date", "yes | yes | yes | yes | yes | – | that there was one"],
             Format::Microchip => ["1 ms, no date", "– | yes | – | – | – | – | –"],
             Format::CanHacker => ["1 ms, no date, of a minute", "– | – | – | – | – | – | –"],

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use cantap::Channel;
 use cantap::autobaud::{Limits, Outcome as Measured};
-use cantap::wire::message::{ChannelConfig, Mode};
+use cantap::wire::message::{ChannelConfig, Mode, capability};
 use cantap_address::OpenDevice;
 use cantap_trace::counted;
 
@@ -69,6 +69,8 @@ impl Bus<'_> {
             }
         };
         let can_measure = bit_rate_search::is_possible(self.device);
+        let is_set_elsewhere = self.device.hello().capabilities & capability::NO_BIT_RATE != 0;
+        let is_known = is_known || is_set_elsewhere && requested.is_none();
         if !is_known && !can_measure {
             return Ok(Check::problem(
                 "bus",
@@ -115,7 +117,7 @@ impl Bus<'_> {
         let meter =
             config.map_or_else(|| Meter::new(0), |config: ChannelConfig| Meter::of(&config, clock_hz));
         let mut received = Received {
-            bitrate_bps: config.map_or(0, |config| config.timing.bitrate_bps(clock_hz)),
+            bitrate_bps: config.and_then(|config| config.timing.known_bitrate_bps(clock_hz)),
             evidence: BusEvidence::default(),
             meter: meter.with_data_bitrate(self.device.data_bitrate(channel)),
             is_filtered: self.device.is_filtered(channel),
@@ -166,9 +168,10 @@ impl Bus<'_> {
             return received.with(certain, &place);
         }
         match outcome_bps(outcome) {
-            Some(bitrate_bps) if !is_same(bitrate_bps, received.bitrate_bps) => {
+            Some(bitrate_bps) if received.bitrate_bps.is_some_and(|own| !is_same(bitrate_bps, own)) => {
+                let own_bps = received.bitrate_bps.unwrap_or_default();
                 let mut check = received.with(BusHint::WrongBitRate, &place);
-                check.found = format!("the bus runs at {bitrate_bps} bit/s, not at {}", received.bitrate_bps);
+                check.found = format!("the bus runs at {bitrate_bps} bit/s, not at {own_bps}");
                 check.next = Some(format!("give -b {}:{bitrate_bps}", place.number));
                 check
             }
@@ -214,7 +217,8 @@ fn is_same(left_bps: u32, right_bps: u32) -> bool {
 
 /// What was received from a bus.
 struct Received {
-    bitrate_bps: u32,
+    /// If known.
+    bitrate_bps: Option<u32>,
     evidence: BusEvidence,
     meter: Meter,
     is_filtered: bool,
@@ -223,7 +227,7 @@ struct Received {
 impl Received {
     fn figures(&self, hint: Option<BusHint>) -> BusFigures {
         BusFigures {
-            bitrate_bps: Some(self.bitrate_bps),
+            bitrate_bps: self.bitrate_bps,
             frames: self.evidence.frames(),
             bus_errors: self.evidence.errors(),
             hint: hint.map(BusHint::name),
@@ -244,9 +248,9 @@ impl Received {
             count => format!("{count} ({})", self.evidence.errors_text(), count = counted(count, "error")),
         };
         let text = format!(
-            "{} at {} bit/s{load}, {errors}",
+            "{}{}{load}, {errors}",
             counted(self.evidence.frames(), "frame"),
-            self.bitrate_bps
+            self.bitrate_bps.map_or_else(String::new, |rate| format!(" at {rate} bit/s"))
         );
         self.check(Verdict::Ok, None, text)
     }
@@ -263,7 +267,8 @@ impl Received {
                 )
             }
         };
-        let found = format!("at {} bit/s {}{figures}", self.bitrate_bps, hint.meaning());
+        let rate = self.bitrate_bps.map_or_else(String::new, |rate| format!("at {rate} bit/s "));
+        let found = format!("{rate}{}{figures}", hint.meaning());
         Check { next: Some(hint.next_step(place)), ..self.check(Verdict::Problem, Some(hint), found) }
     }
 }
@@ -279,7 +284,7 @@ mod tests {
 
     fn received() -> Received {
         let evidence = BusEvidence::default();
-        Received { bitrate_bps: 500_000, evidence, meter: Meter::new(500_000), is_filtered: false }
+        Received { bitrate_bps: Some(500_000), evidence, meter: Meter::new(500_000), is_filtered: false }
     }
 
     /// Only the edges tell them apart: a controller reports neither frames nor errors of both.

@@ -15,7 +15,7 @@ export interface DeviceState {
 export interface ChannelState {
   channel: number;
   /** Bit/s. */
-  bitrate: number;
+  bitrate: number | null;
   /** `active`, `warning`, `passive`, `bus-off`. */
   state: string;
   /** Transmit and receive error counters. */

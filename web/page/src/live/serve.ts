@@ -28,7 +28,7 @@ export async function serve(app: App, served: Served): Promise<void> {
       if (anew) rates.clear();
       await app.takeLive(served.name, chunks, anew);
       for (const { channel, bitrate } of live.state?.channels ?? []) {
-        if (rates.get(channel) === bitrate) continue;
+        if (bitrate === null || rates.get(channel) === bitrate) continue;
         rates.set(channel, bitrate);
         await app.ask('bitrate', { channel, bitrate });
       }

@@ -121,8 +121,8 @@ export class DeviceView implements View {
     );
   }
 
-  #askBitrate(channel: number, now: number): void {
-    const input = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Bit rate', value: now, inputmode: 'decimal' } });
+  #askBitrate(channel: number, now: number | null): void {
+    const input = el('input', { class: 'mono', attrs: { type: 'text', 'aria-label': 'Bit rate', value: now ?? '', inputmode: 'decimal' } });
     const problem = el('p', { class: 'bad', attrs: { role: 'alert' } });
     openDialog(`Bit rate of channel ${channel} of the device`, [field('Bit/s', input, 'for example 500000, 500k, 1M'), el('p', { class: 'muted' }, 'The channels are opened anew: for a moment nothing is received, and afterwards they only listen.'), problem], [
       {

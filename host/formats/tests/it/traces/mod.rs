@@ -48,7 +48,10 @@ pub fn file_name(format: Format, compression: &str) -> String {
         | Format::Labelled
         | Format::Slcan
         | Format::RosEcho
-        | Format::Table => "txt",
+        | Format::Table
+        | Format::EspHome
+        | Format::Sigrok
+        | Format::TraceWindow => "txt",
         Format::Sqlite => "db",
         Format::Parquet => "parquet",
         Format::Json => "jsonl",

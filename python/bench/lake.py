@@ -2,17 +2,22 @@
 
     python bench/lake.py CANTAP --traces 10000 --database a.dbc --database b.dbc
     python bench/lake.py CANTAP --large 5000000 --database a.dbc
+    python bench/lake.py - --large 5000000 --format mf4 --database a.dbc
+
+With `-` the package itself takes the command's place: `cantap.scan` of the whole trace, whose signals pyarrow writes as one file.
 """
 
 import argparse
 import itertools
 import json
+import os
 import random
 import re
 import resource
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -31,6 +36,36 @@ def measured(*arguments):
     subprocess.run([str(argument) for argument in arguments], check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, time.monotonic() - began, after.ru_maxrss / 1024
+
+
+class Watched:
+    """The most bytes in a folder, looked at four times a second."""
+
+    def __init__(self, folder):
+        self.folder, self.most, self._is_over = folder, 0, threading.Event()
+        self._thread = threading.Thread(target=self._watch)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._is_over.set()
+        self._thread.join()
+
+    def _watch(self):
+        while not self._is_over.wait(0.25):
+            self.most = max(self.most, bytes_in(self.folder))
+
+
+def bytes_in(folder):
+    total = 0
+    for path in folder.rglob("*"):
+        try:
+            total += path.stat().st_size if path.is_file() else 0
+        except OSError:
+            pass  # It was removed in that moment.
+    return total
 
 
 def frames(database, count, start, rng):
@@ -79,9 +114,21 @@ def add(lake, sources, database, workers, *more):
     return measured(*command)
 
 
-def report(what, cost, of_frames):
+SCAN = """
+import sys
+import cantap
+import pyarrow as pa
+import pyarrow.parquet as pq
+reader = pa.RecordBatchReader.from_stream(cantap.scan(sys.argv[1], db=sys.argv[2]))
+with pq.ParquetWriter(sys.argv[3], reader.schema, compression="zstd") as writer:
+    for batch in reader:
+        writer.write_batch(batch)
+"""
+
+
+def report(what, cost, of_frames, **more):
     seconds, clock, memory = cost
-    print(json.dumps({"what": what, "processor_s_per_million": round(seconds * 1e6 / of_frames, 2), "processor_s": round(seconds, 2), "s": round(clock, 1), "frames": of_frames, "largest_process_mib": round(memory)}), flush=True)
+    print(json.dumps({"what": what, "processor_s_per_million": round(seconds * 1e6 / of_frames, 2), "processor_s": round(seconds, 2), "s": round(clock, 1), "frames": of_frames, "largest_process_mib": round(memory), **more}), flush=True)
 
 
 def main():
@@ -92,6 +139,7 @@ def main():
     parser.add_argument("--of-each", type=int, default=500, help="frames in a small trace")
     parser.add_argument("--sample", type=int, default=50, help="how many of the small ones cantap decodes one by one")
     parser.add_argument("--large", type=int, default=0, help="frames of the large trace")
+    parser.add_argument("--format", default="blf", choices=["blf", "mf4"], help="of the large trace")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     arguments = parser.parse_args()
     rng = random.Random(1)
@@ -117,14 +165,23 @@ def main():
                         (folder / "out.parquet").unlink()
                 report(f"cantap {step}, {len(each)} of them, one process each", (sum(cost[0] for cost in each), sum(cost[1] for cost in each), 0), len(each) * arguments.of_each)
         if arguments.large:
-            trace, database = folder / "large.blf", arguments.database[0]
+            trace, database = folder / f"large.{arguments.format}", arguments.database[0]
             large(trace, database, arguments.large, rng)
             part = f"{max(trace.stat().st_size // 8 >> 20, 1)}M"
             for workers, more in [(workers, ["--split", split]) for workers in arguments.workers for split in ("0", part)[: workers]]:
                 lake = folder / f"large{workers}{more[1]}"
-                cost = add(lake, [trace], database, workers, *more)
+                temporary = folder / "temporary"
+                temporary.mkdir(exist_ok=True)
+                os.environ["TMPDIR"] = str(temporary)
+                with Watched(temporary) as in_temporary, Watched(lake) as in_lake:
+                    cost = add(lake, [trace], database, workers, *more)
                 [entry] = Store(lake).entries()
-                report(f"lake, {trace.stat().st_size >> 20} MiB, {workers} workers {' '.join(more)}", cost, entry["frames"])
+                sizes = {"lake_mib": bytes_in(lake) >> 20, "most_in_lake_mib": in_lake.most >> 20, "most_in_tmpdir_mib": in_temporary.most >> 20}
+                report(f"lake, {trace.stat().st_size >> 20} MiB, {workers} workers {' '.join(more)}", cost, entry["frames"], **sizes)
+            if arguments.command == "-":
+                cost = measured(sys.executable, "-c", SCAN, trace, database, folder / "out.parquet")
+                report("cantap.scan, signals as one file", cost, entry["frames"])
+                return
             for step, options, out in (("decode", ["--db", database], ["-o"]), ("convert", [], [])):
                 report(f"cantap {step}", measured(arguments.command, step, *options, trace, *out, folder / "out.parquet"), entry["frames"])
                 (folder / "out.parquet").unlink()

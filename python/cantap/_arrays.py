@@ -26,5 +26,5 @@ def _column(table: Table, name: str) -> Any:
         return values
     mask = np.frombuffer(missing, dtype=bool)
     if values.ndim == 2:
-        mask = np.repeat(mask[:, None], values.shape[1], axis=1)
+        mask = mask.reshape(values.shape)
     return np.ma.masked_array(values, mask=mask)

@@ -122,6 +122,9 @@ class Row(Mapping[str, Any]):
     def __len__(self) -> int:
         return len(self._names)
 
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._names)
+
     def __reduce__(self) -> tuple[type[Row], tuple[tuple[str, ...], tuple[Any, ...]]]:
         return (Row, (self._names, self._values))
 
@@ -175,6 +178,9 @@ class Schema(Mapping[str, str]):
 
     def __arrow_c_schema__(self) -> object:
         return self._table.__arrow_c_schema__()
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._types)
 
     def __repr__(self) -> str:
         return "\n".join(f"{name}: {kind}" for name, kind in self._types.items())

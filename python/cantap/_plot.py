@@ -34,14 +34,16 @@ def plot(table: Table, signals: Iterable[str], axes: Axes | None, options: dict[
 
 
 def _series(table: Table, signals: list[str]) -> list[tuple[str, str, Any, Any]]:
-    names = set(table.column_names)
-    if {"signal", "value", "time"} <= names:
+    if all(name in table for name in ("signal", "value", "time")):
         return _of_values(table, signals)
-    if "time" not in names:
+    if "time" not in table:
         raise ValueError("this table has no time to plot over")
     numeric = [name for name in table.column_names if name not in NOT_SIGNALS and table.schema[name] == "float64"]
     if not numeric and not signals:
         raise ValueError("this table has no signals; read it with db=, or use cantap.decode")
+    for signal in signals:
+        if signal not in table:
+            raise ValueError(f"there is no signal '{signal}'; there are {', '.join(numeric)}")
     time = np.asarray(table["time"])
     return [
         (name, table.column_metadata(name).get("unit", ""), time, np.asarray(table[name], dtype=float))

@@ -6,6 +6,7 @@ import glob
 import os
 import posixpath
 import re
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias
@@ -181,8 +182,17 @@ def _traces(folder: str, names: list[str]) -> list[str]:
     others = [os.path.basename(name) or name for name in others if not name.lower().endswith(DATABASE_SUFFIXES)]
     if others:
         shown = ", ".join(others[:3]) + (", …" if len(others) > 3 else "")
-        warnings.warn(f"{folder}: {len(others)} files without the name of a trace were left out: {shown}", CantapWarning, stacklevel=2)
+        several = "files without the name of a trace were" if len(others) > 1 else "file without the name of a trace was"
+        _warn(f"{folder}: {len(others)} {several} left out: {shown}")
     return found
+
+
+def _warn(text: str) -> None:
+    """A warning for the line of the program that called this package, however deep it is in here."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] == "cantap":
+        frame, level = frame.f_back, level + 1
+    warnings.warn(text, CantapWarning, stacklevel=level)
 
 
 def in_order(name: str) -> list[tuple[int, int, str]]:

@@ -6,6 +6,7 @@ import atexit
 import datetime
 import numbers
 import os
+import warnings
 import weakref
 from collections.abc import Iterable, Iterator
 from types import TracebackType
@@ -15,7 +16,7 @@ from . import _native
 from ._arguments import channels as _channels
 from ._arguments import rates as _rates
 from ._arguments import words as _words
-from ._native import Frame, Odx, PeriodicFrame, Record, Records, Reply, Table
+from ._native import CantapWarning, Frame, Odx, PeriodicFrame, Record, Records, Reply, Table
 from .diagnostics import Ecu, load_odx
 from .traces import Path, Rates, Seconds
 
@@ -66,6 +67,7 @@ class Device:
     def __init__(self, address: str, *, capacity: int = CAPACITY) -> None:
         self._native = _native.Device(address)
         self._records = self._native.records(capacity=capacity)
+        self._expects = False
         _open.add(self)
 
     @property
@@ -108,6 +110,7 @@ class Device:
         """
         if bitrate == "auto":
             bitrate = self.autobaud(channel)
+        self._expects = True
         rate, _ = self._native.open_channel(
             channel,
             {
@@ -186,22 +189,35 @@ class Device:
 
     def __iter__(self) -> Iterator[Record]:
         """Records as they arrive: frames, errors, states, losses. Ends when the device is closed."""
+        self._warn_of_silence()
         return self._records
 
     def read(self, timeout: Seconds | None = None) -> Record | None:
         """The next record; `None` if there is none within `timeout` seconds, or after the last."""
+        self._warn_of_silence()
         return self._records.read(timeout)
 
     def batch(self, seconds: Seconds | None = None, rows: int = 65_536) -> Table:
         """Records of the next `seconds`, at most `rows`, as a table; without `seconds` it waits until there are so many."""
+        self._warn_of_silence()
         return self._records.batch(seconds, rows)
 
     def batches(self, seconds: Seconds = 0.1, rows: int = 65_536) -> Iterator[Table]:
         """Tables of what arrived in the last `seconds` or so, one after the other, until the device is closed. None is empty."""
+        self._warn_of_silence()
         while not self.closed:
             table = self._records.batch(seconds, rows)
             if len(table):
                 yield table
+
+    def _warn_of_silence(self) -> None:
+        """Nothing arrives before a channel is open: who waits for it waits for ever."""
+        if self._expects or self.closed:
+            return
+        self._expects = True
+        if not self.channels:
+            text = "no channel is open, so nothing arrives: give cantap.open a bit rate, or call open_channel"
+            warnings.warn(text, CantapWarning, stacklevel=3)
 
     def records(
         self,

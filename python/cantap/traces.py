@@ -57,11 +57,24 @@ def load_database(
 
 
 def _pairs(files: Any) -> list[tuple[int | str | None, Path]]:
-    if isinstance(files, (str, os.PathLike)):
-        return [(None, files)]
     if isinstance(files, Mapping):
-        return [(channel, path) for channel, path in files.items()]
-    return [(None, path) for path in files]
+        return [(channel, _database_file(path)) for channel, path in files.items()]
+    # An open file is not the names that its lines are.
+    if isinstance(files, (str, os.PathLike)) or hasattr(files, "read") or not isinstance(files, Iterable):
+        return [(None, _database_file(files))]
+    return [(None, _database_file(path)) for path in files]
+
+
+def _database_file(path: Any) -> Path:
+    if isinstance(path, (str, os.PathLike)):
+        return path
+    kind = type(path)
+    text = f"a database is the name of a file, several of them, or a mapping from channels to names, not {kind.__name__}"
+    if isinstance(path, Database):
+        text = "a loaded database is given alone; load those of several files or channels together: load_database([…]) or load_database({1: …})"
+    elif kind.__module__.partition(".")[0] in ("cantools", "canmatrix"):
+        text += f" of {kind.__module__.partition('.')[0]}; give the file that it was loaded from, or one that it is written to"
+    raise TypeError(text)
 
 
 def scan(
@@ -145,6 +158,17 @@ class Messages(Mapping[str, Table]):
 
     def __len__(self) -> int:
         return len(self._tables)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            # While a copy is made there are no tables yet.
+            if not name.startswith("_") and name in self._tables:
+                raise AttributeError(f"a message is taken by its name: messages['{name}']")
+            raise AttributeError(f"'Messages' object has no attribute '{name}'")
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return list(self._tables)
 
     def plot(self, *signals: str, ax: Axes | None = None, **options: Any) -> Axes:
         """Plots signals over time with Matplotlib, as steps: `"Engine.Speed"`, or `"Speed"` if only one message has it."""
@@ -313,7 +337,8 @@ def dataset(
 
     if message is not None and db is None:
         raise ValueError("a message is decoded with a database; give one with db=")
-    return Dataset(files(path), _options(path, db, signals, filter, channel, start, end, format, zone, strict), message)
+    options = _options(path, db, signals, filter, channel, start, end, format, zone, strict)
+    return Dataset(options["files"], options, message)
 
 
 def _is_file(source: Any) -> bool:
@@ -333,6 +358,8 @@ def _unpacked(source: Any) -> Any:
 
 def _table(source: Any) -> Any:
     """A table of records: of messages of python-can, too."""
+    if isinstance(source, Messages):
+        raise TypeError("these are decoded signals: cantap.encode(messages, db) makes frames of them, and each of its tables has to_pandas() and to_polars()")
     source = _columns_table(source)
     is_table = hasattr(source, "__arrow_c_stream__")
     if not is_table and isinstance(source, Iterable) and not isinstance(source, (str, bytes)):

@@ -11,8 +11,8 @@ use pyo3::types::PyBytes;
 
 use crate::error::Error;
 
-/// NumPy's name of the type, bytes, a mask of rows without a value if there are any, texts for the numbers if there are any, bytes
-/// per row.
+/// NumPy's name of the type, bytes, a mask of rows without a value if there are any (of each byte, if rows have different lengths), texts
+/// for the numbers if there are any, bytes per row.
 pub type Parts<'py> =
     (&'static str, Bound<'py, PyBytes>, Option<Bound<'py, PyBytes>>, Option<Vec<String>>, usize);
 
@@ -34,8 +34,9 @@ pub fn parts<'py>(py: Python<'py>, column: &dyn Array) -> Result<Parts<'py>, Err
             numbers("bool", &values, 1)
         }
         DataType::Binary => {
-            let (rows, width) = padded(column.as_binary());
-            numbers("uint8", &rows, width)
+            let (rows, missing, width) = padded(column.as_binary());
+            let missing = missing.contains(&1).then(|| PyBytes::new(py, &missing));
+            Ok(("uint8", PyBytes::new(py, &rows), missing, None, width))
         }
         DataType::Dictionary(key, _) => {
             let dictionary = column.as_any_dictionary();
@@ -56,13 +57,15 @@ fn bytes<T: ArrowPrimitiveType>(column: &dyn Array) -> Vec<u8> {
     values.values().inner().as_slice().to_vec()
 }
 
-/// Rows of one width, padded with zeros.
-fn padded(column: &BinaryArray) -> (Vec<u8>, usize) {
+/// Rows of one width, padded with zeros; and 1 for each byte that is only there for that.
+fn padded(column: &BinaryArray) -> (Vec<u8>, Vec<u8>, usize) {
     let width = column.iter().flatten().map(<[u8]>::len).max().unwrap_or(0);
-    let mut rows = vec![0; width * column.len()];
+    let (mut rows, mut missing) = (vec![0; width * column.len()], vec![1; width * column.len()]);
     for (row, bytes) in column.iter().enumerate() {
         let bytes = bytes.unwrap_or_default();
-        rows[row * width..row * width + bytes.len()].copy_from_slice(bytes);
+        let place = row * width..row * width + bytes.len();
+        rows[place.clone()].copy_from_slice(bytes);
+        missing[place].fill(0);
     }
-    (rows, width)
+    (rows, missing, width)
 }

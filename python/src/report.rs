@@ -150,6 +150,25 @@ impl Counts {
     }
 }
 
+impl Counts {
+    /// Which files have no record at all, in words; `None` if each has one.
+    pub fn without_record(&self) -> Option<String> {
+        let files = if self.files.is_empty() { std::slice::from_ref(self) } else { self.files.as_slice() };
+        let empty: Vec<_> = files.iter().filter(|file| file.is_empty()).collect();
+        match empty.as_slice() {
+            [] => None,
+            [file] => Some(format!("{}: it has no record", file.file)),
+            [first, ..] => Some(format!("{}, and {} more: they have no record", first.file, empty.len() - 1)),
+        }
+    }
+
+    /// Whether the file is as it should be and has nothing in it.
+    fn is_empty(&self) -> bool {
+        let nothing_else = self.left_out.is_empty() && self.channels == Channels::default();
+        self.is_whole && self.issues == 0 && self.records_read == 0 && nothing_else
+    }
+}
+
 /// Descriptions and counts.
 pub fn by_kind(counts: &LeftOut) -> BTreeMap<String, u64> {
     counts.iter().map(|(what, count)| (what.to_owned(), count)).collect()

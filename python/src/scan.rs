@@ -149,14 +149,16 @@ enum State {
     Ended,
 }
 
-/// Reports what could not be read, and channels that were named although the file does not have them, as Python warnings.
+/// Reports what could not be read, files without a record, and channels that were named although the file does not have them, as Python
+/// warnings.
 pub fn warn(py: Python<'_>, report: &Report, named: &[Named]) -> PyResult<()> {
     warnings(&report.now(), named).try_for_each(|text| warning(py, &text))
 }
 
 fn warnings(counts: &Counts, named: &[Named]) -> impl Iterator<Item = String> {
     let missing = |named: &Named| named.missing_in(&counts.file, &counts.channels);
-    counts.warning().into_iter().chain(named.iter().filter_map(missing))
+    let of_file = counts.warning().into_iter().chain(counts.without_record());
+    of_file.chain(named.iter().filter_map(missing))
 }
 
 /// Issues a Python warning for the caller of the function in Python's half.

@@ -7,12 +7,14 @@ use std::sync::Arc;
 
 use arrow_array::ffi::FFI_ArrowSchema;
 use arrow_array::ffi_stream::{FFI_ArrowArrayStream, RecordBatchStreamReader};
-use arrow_array::{Array, RecordBatch, RecordBatchIterator, RecordBatchReader, StructArray};
+use arrow_array::{
+    Array, ArrayRef, RecordBatch, RecordBatchIterator, RecordBatchReader, StructArray, new_empty_array,
+};
 use arrow_ipc::reader::StreamReader;
 use arrow_ipc::writer::StreamWriter;
 use arrow_schema::{ArrowError, SchemaRef};
 use cantap_trace::counted;
-use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::exceptions::{PyAttributeError, PyKeyError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyCapsule, PyDict, PyList, PySlice, PyTuple};
 
@@ -103,16 +105,12 @@ impl Table {
 
     /// A column's parts for NumPy, for the Python half.
     fn _parts<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Parts<'py>> {
-        let batch = self.one_batch()?;
-        let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
-        Ok(numpy::parts(py, column.as_ref())?)
+        Ok(numpy::parts(py, self.column(name)?.as_ref())?)
     }
 
     /// A column's values as a list, for the Python half.
     fn _values<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyList>> {
-        let batch = self.one_batch()?;
-        let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
-        values::values(py, column.as_ref())
+        values::values(py, self.column(name)?.as_ref())
     }
 
     /// The columns by name, each with its type.
@@ -143,14 +141,38 @@ impl Table {
             return Ok(Bound::new(py, table.slice(start, count))?.into_any());
         }
         let Ok(names) = key.extract::<Vec<String>>() else {
-            if key.hasattr("__index__")? {
-                return py.import("cantap._columns")?.call_method1("row", (slf, key));
+            // NumPy's arrays have it too, and refuse.
+            if let Ok(number) = key.call_method0("__index__") {
+                return py.import("cantap._columns")?.call_method1("row", (slf, number));
             }
             return Err(PyTypeError::new_err(
-                "a table is asked for a column by its name, for columns by a list of names, for a row by its number, and for rows by a slice",
+                "a table is asked for a column by its name, for columns by a list of names, for a row by its number, and for rows by a slice; \
+                 rows that meet a condition are chosen in to_pandas() or to_polars()",
             ));
         };
         Ok(Bound::new(py, table.select(&names)?)?.into_any())
+    }
+
+    /// Whether it has a column of this name; of anything else, whether it is one of the rows.
+    fn __contains__(slf: &Bound<'_, Self>, key: &Bound<'_, PyAny>) -> PyResult<bool> {
+        match key.extract::<String>() {
+            Ok(name) => Ok(slf.get().schema.index_of(&name).is_ok()),
+            Err(_) => Self::__iter__(slf)?.contains(key),
+        }
+    }
+
+    /// Only for names that it does not have: what to write instead.
+    fn __getattr__(&self, name: &str) -> PyResult<()> {
+        let advice = match self.schema.index_of(name) {
+            Ok(_) => format!("a column is table['{name}']"),
+            Err(_) => "what pandas and Polars can do, to_pandas() and to_polars() can".to_owned(),
+        };
+        Err(PyAttributeError::new_err(format!("a table has no attribute '{name}'; {advice}")))
+    }
+
+    /// What a notebook offers behind `table["`.
+    fn _ipython_key_completions_<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        self.column_names(py)
     }
 
     /// Plots signals over time with Matplotlib.
@@ -288,7 +310,20 @@ impl Table {
 
     fn no_column(&self, name: &str) -> PyErr {
         let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).collect();
-        PyValueError::new_err(format!("there is no column '{name}'; there are {}", names.join(", ")))
+        PyKeyError::new_err(format!("there is no column '{name}'; there are {}", names.join(", ")))
+    }
+
+    /// All rows of a column in one piece; nothing is copied if they already are, and nothing of other columns.
+    fn column(&self, name: &str) -> PyResult<ArrayRef> {
+        let place = self.schema.index_of(name).map_err(|_| self.no_column(name))?;
+        match self.batches.as_slice() {
+            [batch] => Ok(Arc::clone(batch.column(place))),
+            [] => Ok(new_empty_array(self.schema.field(place).data_type())),
+            batches => {
+                let pieces: Vec<_> = batches.iter().map(|batch| batch.column(place).as_ref()).collect();
+                arrow_select::concat::concat(&pieces).map_err(arrow_error)
+            }
+        }
     }
 
     /// All rows in one batch; nothing is copied if they already are.

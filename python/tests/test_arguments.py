@@ -2,6 +2,7 @@
 
 import datetime
 
+import cantools
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -170,6 +171,28 @@ def two_channels(tmp_path):
     for database, name in zip(databases, ("First", "Second", "Third")):
         database.write_text(DBC.format(name=name))
     return log, databases
+
+
+def test_what_is_no_name_of_a_database_is_told_what_would_be(log, tmp_path):
+    path = tmp_path / "car.dbc"
+    path.write_text(DBC.format(name="Engine"))
+    words = "a database is the name of a file, several of them, or a mapping from channels to names, not "
+    loaded = cantools.database.load_file(path)
+    with open(path) as text, open(path, "rb") as binary:
+        for wrong, said in [
+            (text, words + "TextIOWrapper"), (binary, words + "BufferedReader"), ([binary], words + "BufferedReader"), (5, words + "int"),
+            (loaded, words + "Database of cantools; give the file that it was loaded from"), ({1: loaded}, words + "Database of cantools"),
+            ([cantap.load_database(path)], "a loaded database is given alone"),
+        ]:  # fmt: skip
+            for call in (lambda: cantap.read(log, db=wrong), lambda: cantap.decode(log, wrong), lambda: cantap.load_database(wrong)):
+                with pytest.raises(TypeError) as caught:
+                    call()
+                assert str(caught.value).startswith(said)
+    messages = cantap.decode(log, path)
+    for call in (lambda: cantap.write(messages, tmp_path / "made.log"), lambda: cantap.decode(messages, path)):
+        with pytest.raises(TypeError, match="these are decoded signals: cantap.encode"):
+            call()
+    assert not (tmp_path / "made.log").exists()
 
 
 @pytest.mark.filterwarnings("error")

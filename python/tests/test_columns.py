@@ -35,8 +35,36 @@ def test_a_column_is_taken_by_its_name(table):
     assert table["Gear.text"].to_list()[:4] == ["<b>park", "drive\N{REPLACEMENT CHARACTER}[2J", None, None]
     # A missing value is none, and no number.
     assert table["Late"].to_list()[:3] == [None, 0.0, 0.0] and np.isnan(np.asarray(table["Late"])[0])
-    with pytest.raises(ValueError, match="no column 'Sped'; there are time, "):
-        table["Sped"]
+    for wrong in ("Sped", ["time", "Sped"]):
+        with pytest.raises(KeyError, match="no column 'Sped'; there are time, "):
+            table[wrong]
+
+
+def test_a_name_is_in_a_table_if_it_has_such_a_column(table):
+    assert "Speed" in table and "Sped" not in table and "Speed" in table.schema and "Speed" in table[0]
+    assert table[3] in table and 3 not in table
+
+
+def test_what_a_table_does_not_have_leads_to_what_has_it(table):
+    with pytest.raises(AttributeError, match=r"a table has no attribute 'Speed'; a column is table\['Speed'\]"):
+        table.Speed
+    with pytest.raises(AttributeError, match=r"has no attribute 'head'; what pandas and Polars can do, to_pandas\(\) and to_polars\(\) can"):
+        table.head
+    with pytest.raises(TypeError, match="rows that meet a condition are chosen in to_pandas"):
+        table[np.asarray(table["Speed"]) > 3]
+    assert table[np.int64(3)]["Speed"] == 1.5
+
+
+def test_a_notebook_completes_names_of_columns_and_messages(table, tmp_path):
+    drive = cantap.decode(tmp_path / "drive.log", tmp_path / "car.dbc")
+    for keyed, names in ((table, table.column_names), (table[0], table.column_names), (table.schema, table.column_names), (drive, ["Engine"])):
+        assert list(keyed._ipython_key_completions_()) == list(names)
+    with pytest.raises(AttributeError, match=r"a message is taken by its name: messages\['Engine'\]"):
+        drive.Engine
+    with pytest.raises(AttributeError, match="no attribute 'engine'"):
+        drive.engine
+    again = copy.copy(drive)
+    assert list(again) == list(pickle.loads(pickle.dumps(drive))) == ["Engine"] and len(again["Engine"]) == 20
 
 
 def test_rows_are_taken_by_a_slice_and_columns_by_a_list(table):

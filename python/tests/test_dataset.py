@@ -127,3 +127,8 @@ def test_what_the_base_class_offers_does_not_crash(traces, db):
 def test_each_query_reads_again(traces):
     dataset = cantap.dataset(traces / "0.log")
     assert dataset.count_rows() == dataset.count_rows() == 50
+
+
+def test_a_generator_of_files_is_a_dataset(traces):
+    dataset = cantap.dataset(traces.glob("0.log"))
+    assert dataset.count_rows() == dataset.count_rows() == 50

@@ -10,6 +10,7 @@ import sys
 import textwrap
 import threading
 import time
+import warnings
 
 import pyarrow as pa
 import pytest
@@ -49,6 +50,22 @@ def test_records_come_in_order_with_the_devices_stamps():
     assert {record.event for record in records} == {"frame"}
     assert losses[1]["lost"] == losses[2]["lost"] == 0
     assert device.closed and "closed" in repr(device)
+
+
+def test_waiting_for_a_device_without_an_open_channel_is_said_once():
+    for wait in (lambda device: device.read(0), lambda device: device.batch(0), iter):
+        with cantap.open("virtual") as device:
+            with pytest.warns(cantap.CantapWarning, match="no channel is open, so nothing arrives: give cantap.open a bit rate, or call open_channel") as said:
+                wait(device)
+                wait(device)
+            assert [warning.filename for warning in said] == [__file__]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with cantap.open("virtual", 500_000) as device:
+            assert device.read(5) is not None
+            device.close_channel(1)
+            device.close_channel(2)
+            device.read(0)
 
 
 def test_intervals_are_the_devices_own_on_request():

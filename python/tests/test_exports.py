@@ -1,6 +1,7 @@
 """What other programs get: InfluxDB's line protocol, and Grafana's dashboard of a server's figures."""
 
 import json
+import math
 import re
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 pa = pytest.importorskip("pyarrow")
 
+import cantap
 from cantap.lake import Store, command, influx, ingest
 
 REPOSITORY = Path(__file__).parents[2]
@@ -146,6 +148,51 @@ def test_the_dashboard_of_a_lake_asks_for_what_the_views_have(lake, database):
     assert len(set(places)) == len(places) and len({panel["id"] for panel in dashboard["panels"]}) == len(places)
     # Nothing outside of the time that is shown.
     assert fetched(database.sql(filled(dashboard["panels"][3]["targets"][0]["rawSql"], values, "2020-01-01", "2020-01-02"))) == []
+
+
+def test_messages_are_views_with_a_column_for_each_signal(lake, tmp_path, capsys):
+    duckdb = pytest.importorskip("duckdb")
+    # At one nanosecond: frames of one message, multiplexed; and names that DuckDB takes for the same.
+    odd = tmp_path / "odd.dbc"
+    signals = ' SG_ Page M : 0|8@1+ (1,0) [0|0] "" A\n SG_ Low m0 : 8|8@1+ (1,0) [0|0] "" A\n SG_ High m1 : 8|8@1+ (1,0) [0|0] "" A\n'
+    more = 'BO_ 512 engine: 8 A\n SG_ time : 0|8@1+ (1,0) [0|0] "" A\n SG_ speed : 8|8@1+ (1,0) [0|0] "" A\n SG_ Speed : 16|8@1+ (1,0) [0|0] "" A\n'
+    odd.write_text(f'VERSION ""\nBU_: A\nBO_ 511 Pages: 8 A\n{signals}{more}')
+    log = tmp_path / "odd" / "1.log"
+    log.parent.mkdir()
+    log.write_text("".join(f"(1772409590.000000) can0 {frame}\n" for frame in ("1FF#0001", "1FF#0102", "1FF#0003", "1FF#0104", "200#010203")))
+    ingest(log, lake, db=odd, workers=1)
+    assert command.main(["views", str(lake), "--wide"]) == 0
+    connection = duckdb.connect()
+    connection.execute(capsys.readouterr().out)
+
+    def rows(view, *columns):
+        chosen = ", ".join(f'"{column}"' for column in columns)
+        return connection.execute(f'select {chosen} from messages."{view}" order by all').fetchall()
+
+    assert rows("Engine", "vehicle", "channel", "time_ns", "Speed", "Gear", "Gear.text", "Ratio") == [
+        ("a =,b", 1, 1772409590 * 10**9, 5.0, 1.0, r'a "b", \\c = d', 1.5),
+        ("a =,b", 1, 1772409590 * 10**9, 5.5, 2.0, None, pytest.approx(math.nan, nan_ok=True)),
+    ]
+    assert rows("Other", "channel", "Speed") == [(2, 5.0)]
+    assert rows("Pages", "Page", "Low", "High") == [(0.0, 1.0, None), (0.0, 3.0, None), (1.0, None, 2.0), (1.0, None, 4.0)]
+    assert rows("engine 2", "engine.time", "Speed", "engine.speed") == [(1.0, 3.0, 2.0)]
+    counted = connection.execute("select count(*) from signals where event = 'value' and signal = 'Page'").fetchone()
+    assert counted == connection.execute('select count(*) from messages."Pages"').fetchone()
+
+
+def test_what_mf4_files_say_about_their_measurements_is_a_column(tmp_path, capsys):
+    duckdb = pytest.importorskip("duckdb")
+    drives = tmp_path / "drives" / "007"
+    drives.mkdir(parents=True)
+    (drives / "0.log").write_text("(1.000000) can0 123#0A\n")
+    cantap.write(cantap.read(drives / "0.log"), drives / "1.mf4")
+    ingest(tmp_path / "drives", tmp_path / "lake", workers=1)
+    assert {entry["format"]: entry["properties"].get("tool_id") for entry in Store(tmp_path / "lake").entries()} == {"candump": None, "mf4": "cantap"}
+    assert command.main(["views", str(tmp_path / "lake")]) == 0
+    connection = duckdb.connect()
+    connection.execute(capsys.readouterr().out)
+    query = "select trace, count(*) from frames join ledger using (vehicle, trace) where properties['tool_id'] = 'cantap' group by trace"
+    assert connection.execute(query).fetchall() == [(str(drives / "1.mf4"), 1)]
 
 
 def test_views_have_the_rows_of_the_ledger_and_the_types_of_the_tables(lake, database, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """What a lake has of one trace."""
 
+import random
 
 import pytest
 
@@ -7,6 +8,7 @@ pa = pytest.importorskip("pyarrow")
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+import cantap
 from cantap.lake import columns, decoding, writing
 
 # As in its process: faults are in the ledger.
@@ -82,6 +84,29 @@ def test_what_is_wrong_with_the_trace_comes_before_what_is_wrong_with_its_databa
     assert (entry.state, entry.coverage) == ("cut", 0) and frames == FRAMES - 1 and signals == 0
     first, _, second = entry.problem.rpartition("; ")
     assert "ends inside a line" in first and second.startswith("no signals: ")
+
+
+def test_waiting_rows_take_a_few_times_the_length_of_their_trace(tmp_path):
+    """They wait in a temporary folder until the trace is done."""
+    chance = random.Random(1)
+    frames = ((at // 2, at % 2 + 1, f"{0x100 + at % 50:03X}#{chance.randbytes(8).hex()}") for at in range(20_000))
+    log, trace, database = (tmp_path / name for name in ("drive.log", "drive.blf", "car.dbc"))
+    log.write_text("".join(f"({1_770_000_000 + at * 1e-3:.6f}) can{channel} {frame}\n" for at, channel, frame in frames))
+    cantap.write(cantap.scan(log), trace)
+    signals = "".join(f' SG_ S{{number}}x{at} : {at * 8}|8@1+ (0.5,0) [0|255] "km/h" A\n' for at in range(8))
+    messages = ("BO_ {id} M{number}: 8 A\n" + signals).format
+    database.write_text('VERSION ""\nBU_: A\n' + "".join(messages(id=0x100 + number, number=number) for number in range(50)))
+    for stem, most in ((None, 30), ("abc", 15)):
+        folder = tmp_path / str(stem)
+        folder.mkdir()
+        entry, _ = decoding.decode({
+            "path": str(trace), "trace": "001/drive.blf", "vehicle": "001", "bytes": 1, "databases": [(None, str(database))],
+            "database_names": ["car.dbc"], "j1939": False, "signals": [], "zone": None, "part": None, "divide": None,
+            "rows": str(folder if stem else folder / "rows.arrow"), "stem": stem,
+        })  # fmt: skip
+        assert (entry.state, entry.signal_rows) == ("read", 160_000)
+        spilled = sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+        assert spilled < most * trace.stat().st_size, (spilled, trace.stat().st_size)
 
 
 def test_files_have_the_rows_of_the_stream(tmp_path):

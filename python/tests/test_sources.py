@@ -59,8 +59,35 @@ def test_a_relative_time_counts_from_the_first_of_all_records(folder):
 def test_what_is_no_trace_in_a_folder_is_said(folder):
     (folder / "notes.docx").write_bytes(b"PK")
     (folder / ".hidden").write_bytes(b"x")
-    with pytest.warns(cantap.CantapWarning, match="1 files without the name of a trace were left out: notes.docx"):
+    for call in (lambda: cantap.read(folder), lambda: cantap.read([folder]), lambda: cantap.dataset(folder).to_table()):
+        with pytest.warns(cantap.CantapWarning, match="1 file without the name of a trace was left out: notes.docx") as said:
+            assert len(call()) == 9
+        # Once, and of the program's own line.
+        assert [warning.filename for warning in said] == [__file__]
+
+
+def test_a_trace_without_a_record_is_said(folder):
+    empty = folder / "3.log"
+    empty.write_bytes(b"")
+    for call in (lambda: cantap.read(empty), lambda: cantap.decode(empty, folder / "car.dbc"), lambda: cantap.stats(folder), lambda: cantap.read(folder)):
+        with pytest.warns(cantap.CantapWarning, match="3.log: it has no record"):
+            call()
+    (folder / "4.log").write_bytes(b"")
+    with pytest.warns(cantap.CantapWarning, match="3.log, and 1 more: they have no record"):
         assert len(cantap.read(folder)) == 9
+
+
+@pytest.mark.filterwarnings("error")
+def test_nothing_is_said_of_a_trace_of_which_nothing_was_chosen(folder):
+    for chosen in ({"filter": "7FF"}, {"start": "1h"}, {"end": "1971-01-01", "start": "1970-06-01"}, {"start": 5, "end": 6}):
+        assert len(cantap.read(folder / "1.log", **chosen)) == 0
+
+
+def test_a_parquet_file_of_something_else_says_what_it_should_have(folder, tmp_path):
+    decoded = tmp_path / "engine.parquet"
+    cantap.decode(folder / "1.log", folder / "car.dbc")["Engine"].to_polars().write_parquet(decoded)
+    with pytest.raises(cantap.FormatError, match="whose columns are not those of a trace, such as time, id and data"):
+        cantap.read(decoded)
 
 
 def test_a_missing_file_among_several_is_named(folder, tmp_path):

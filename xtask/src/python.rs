@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use xshell::{Shell, cmd};
 
+use crate::dist::notices;
 use crate::fleet;
 use crate::outcome::Outcome;
 use crate::peers::{self, Peers};
@@ -13,8 +14,17 @@ use crate::{tests, workspace};
 /// Where its crate is.
 const MANIFEST: &str = "python/Cargo.toml";
 
+/// Writes the licences of the package and of other people's crates in it to where maturin packs them from.
+pub fn licences(shell: &Shell) -> Result<()> {
+    for ours in ["LICENSE-APACHE", "LICENSE-MIT"] {
+        shell.copy_file(ours, "python")?;
+    }
+    notices::write(shell, Path::new("python/LICENSES-THIRD-PARTY.txt"), &["-p", "cantap-python"])
+}
+
 /// Packs the sources, including those of the crates it is made of, and builds a wheel from them alone. Returns both.
 pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
+    licences(shell)?;
     let maturin = peers::venv(shell)?.join("bin/maturin");
     let packed = target().join("sources");
     shell.remove_path(&packed)?;

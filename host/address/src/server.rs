@@ -141,6 +141,12 @@ impl Server {
             };
             return with_port(place).map(|place| Self::Tls(place, keys));
         }
+        #[cfg(not(feature = "tls"))]
+        if text.starts_with("tls:") {
+            return Err(
+                "this was built without TLS, its feature `tls`; use ssh://, or build it with that".to_owned()
+            );
+        }
         match text.strip_prefix("ssh://") {
             Some(place) if !place.is_empty() => Ssh::parse(place).map(Self::Ssh),
             _ => Err("write it as unix:PATH, tcp://HOST:PORT, tls://HOST:PORT or ssh://[USER@]HOST[/DEVICE]"
@@ -302,6 +308,8 @@ mod tests {
         assert_eq!(parse("unix:/run/a"), Ok(Server::Unix("/run/a".into())));
         #[cfg(feature = "tls")]
         assert_eq!(parse("tls://car?keys=k/me"), Ok(Server::Tls(format!("car:{PORT}"), Some("k/me".into()))));
+        #[cfg(not(feature = "tls"))]
+        assert!(parse("tls://car").unwrap_err().contains("without TLS"));
         for wrong in [
             "tls:car",
             "tls://",

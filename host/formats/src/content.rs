@@ -49,6 +49,10 @@ pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
     }
     let line = text.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default();
     if line.iter().any(|byte| *byte < b' ' && *byte != b'\t') {
+        if read_as == Format::Parquet {
+            return "a Parquet file that is damaged, or whose columns are not those of a trace, such as time, id and data"
+                .to_owned();
+        }
         if Format::of_content(head).is_some() {
             return format!("a file of the format {read_as} that is damaged or has nothing usual in it");
         }
@@ -110,6 +114,10 @@ mod tests {
         assert!(looks_like(journal, Format::Candump).starts_with("lines of a system's journal"));
         let words = "a file of the format blf that is damaged or has nothing usual in it";
         assert_eq!(looks_like(b"LOGG\x90\0\0\0", Format::Blf), words);
+        assert!(
+            looks_like(b"PAR1\x15\x04\x15", Format::Parquet)
+                .contains("whose columns are not those of a trace")
+        );
         assert_eq!(looks_like(b"date nonsense", Format::Asc), "text that begins with 'date nonsense'");
     }
 }

@@ -46,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     delta.add_argument("lake")
     sql = commands.add_parser("views", help="print SQL that makes views of the tables and the ledger in a database of DuckDB")
     sql.add_argument("lake")
+    sql.add_argument("--wide", action="store_true", help="also a view for each message, with a column for each signal; reads the names of all signals")
     joining = commands.add_parser("compact", help="join small files of the same vehicle, day and channel; rows and ledger stay the same")
     joining.add_argument("lake")
     default = f"{FILE_BYTES >> 20}M"
@@ -191,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{len(vacuum(chosen.lake, retain_hours=chosen.older_than))} files removed")
             return 0
         if chosen.command == "views":
-            print(views(Store(chosen.lake)), end="")
+            print(views(Store(chosen.lake), wide=chosen.wide), end="")
             return 0
         if chosen.command == "delta":
             for table in TABLES:

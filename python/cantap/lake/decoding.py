@@ -94,7 +94,7 @@ class _Stream:
     def __init__(self, request: Request) -> None:
         self._request = request
         self._file = pa.OSFile(request["rows"], "wb")
-        self._writer = pa.ipc.new_stream(self._file, columns.STREAM_SCHEMA)
+        self._writer = pa.ipc.new_stream(self._file, columns.STREAM_SCHEMA, options=pa.ipc.IpcWriteOptions(compression="zstd"))
 
     def __enter__(self) -> _Stream:
         return self
@@ -184,7 +184,7 @@ def _decode(request: Request, rows: _Stream | Writing | _Counted) -> Entry:
         entry.lost, entry.lost_at_least = report.lost, report.lost_at_least
         entry.bus_errors, entry.issues = report.bus_errors, report.issues
         entry.faults = [_without_folders(fault, request) for fault in report.faults]
-        entry.left_out, entry.notes = report.left_out, report.notes
+        entry.left_out, entry.notes, entry.properties = report.left_out, report.notes, report.properties
         entry.problem = entry.faults[0] if entry.faults else None
         entry.state = _state(report)
         if request["databases"] and report.frames:

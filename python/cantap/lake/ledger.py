@@ -52,6 +52,8 @@ class Entry:
     left_out: dict[str, int] = field(default_factory=dict)
     #: What is not wrong but should be known, by kind.
     notes: dict[str, int] = field(default_factory=dict)
+    #: What an MF4 file says about its measurement: device, session, author.
+    properties: dict[str, str] = field(default_factory=dict)
     databases: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
@@ -63,5 +65,5 @@ class Entry:
 DDL = (
     "trace string, vehicle string, bytes bigint, state string, problem string, format string, records bigint, frames bigint, "
     "lost bigint, lost_at_least boolean, bus_errors bigint, decoded bigint, coverage double, signal_rows bigint, issues bigint, "
-    "faults array<string>, left_out map<string, bigint>, notes map<string, bigint>, databases array<string>"
+    "faults array<string>, left_out map<string, bigint>, notes map<string, bigint>, properties map<string, string>, databases array<string>"
 )

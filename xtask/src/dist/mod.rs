@@ -27,6 +27,8 @@ enum What {
     Deb,
     /// The package for Python: a wheel for this system, and the sources that it builds from.
     Python,
+    /// The licences that such a wheel has, in `python/`, where maturin finds them.
+    PythonLicences,
     /// An archive for each board: ELF, and the image for `dfu-util`.
     Firmware,
 }
@@ -38,11 +40,15 @@ pub fn run(args: &Args) -> Result<()> {
     let shell = workspace::shell()?;
     let dist = workspace::target().join("dist");
     shell.create_dir(&dist)?;
-    for what in if args.what.is_empty() { What::value_variants() } else { &args.what } {
+    // The package for Python has its own licences anyway.
+    let everything =
+        What::value_variants().iter().filter(|what| **what != What::PythonLicences).copied().collect();
+    for what in if args.what.is_empty() { everything } else { args.what.clone() } {
         match what {
             What::Command => command::pack(&shell, &dist)?,
             What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is not Linux"),
             What::Deb => deb::pack(&shell, &dist)?,
+            What::PythonLicences => python::licences(&shell)?,
             What::Python => {
                 for file in python::dist(&shell)? {
                     shell.copy_file(file, &dist)?;

@@ -42,11 +42,10 @@ pub fn channels(text: &str) -> Result<Channels, String> {
     }
     let numbers = text.split(',').map(channel_number).collect::<Option<Vec<_>>>();
     numbers.map(Channels::of_numbers).ok_or_else(|| {
-        if Address::is_meant_by(Path::new(text)) {
-            return format!("a device is given with -d, as in: -d {text}");
-        }
-        "channels are 1, 2, several as 1,3, or both; a second device has 3 and 4, and can0 in a trace is channel 1"
-            .to_owned()
+        in_place_of_channel(text).unwrap_or_else(|| {
+            "channels are 1, 2, several as 1,3, or both; a second device has 3 and 4, and can0 in a trace is channel 1"
+                .to_owned()
+        })
     })
 }
 
@@ -70,6 +69,12 @@ pub fn channel_of_trace(text: &str) -> Result<u8, String> {
     grammar::channel(text).ok_or_else(|| {
         "a trace's channels are 1, 2 and so on up to 255, several as 1,3; can0 is channel 1".to_owned()
     })
+}
+
+/// What to write if a device stands where a channel should; can2 is an interface, too, and here a channel that there is not.
+pub fn in_place_of_channel(text: &str) -> Option<String> {
+    let is_device = grammar::channel(text).is_none() && Address::is_meant_by(Path::new(text));
+    is_device.then(|| format!("a device is given with -d, as in: -d {text}"))
 }
 
 /// One channel of a device, as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.

@@ -144,7 +144,8 @@ fn channels(text: &str) -> Result<Channels, String> {
     if text == "both" {
         return Ok(Channel::ALL.into_iter().collect());
     }
-    let channel = args::channel(text).map_err(|error| format!("{error}, or both"))?;
+    let channel = args::channel(text)
+        .map_err(|error| args::in_place_of_channel(text).unwrap_or_else(|| format!("{error}, or both")))?;
     Ok([channel].into_iter().collect())
 }
 

@@ -100,11 +100,11 @@ fn fd_frames_that_switch_have_a_load_only_with_their_data_bit_rate() {
 #[test]
 fn no_bit_rate_is_asked_for_where_only_the_load_needs_it() {
     let log = Path::new(env!("CARGO_TARGET_TMPDIR")).join("adapters/no-rate.log");
-    let line = |more: &str| format!("capture -d PIPE -n 100 --force {more} -o {}", log.display());
-    let (out, _) = on_pipe("no-rate-json", &line("--json"));
+    let line = format!("capture -d PIPE -n 100 --force -o {}", log.display());
+    let (out, _) = on_pipe("no-rate-json", &format!("{line} --json"));
     let channel = &object(&out)["channels"][0];
     assert_eq!((&channel["frames"], &channel["bus_load_pct"]), (&100.into(), &Value::Null), "{out}");
-    let (_, err) = on_pipe("no-rate", &line(""));
+    let (_, err) = on_pipe("no-rate", &line);
     assert!(err.contains("the bit rate is not known: give it with -b"), "{err}");
     let (out, _) = on_pipe("no-rate-stats", "stats -d PIPE -t 700ms");
     assert!(out.contains("bit rate unknown: give it with -b"), "{out}");

@@ -21,6 +21,8 @@ pub(crate) struct Decoder {
     open: Option<Open>,
     /// Frames that ended without their bytes, to be reported.
     without_bytes: u64,
+    /// Whether there was a line of the component.
+    has_lines: bool,
 }
 
 /// A frame whose bytes are in the next lines.
@@ -90,6 +92,7 @@ impl RowFormat for Decoder {
         let Some(text) = said(plain) else {
             return Ok(if plain.is_empty() { Line::Nothing } else { Line::LeftOut(OTHERS) });
         };
+        self.has_lines = true;
         if let Some(fields) = fields(text) {
             self.without_bytes += u64::from(self.open.take().is_some());
             let open = Open { fields: fields?, time_ns: self.clock.time_ns, bytes: Vec::new() };
@@ -120,7 +123,11 @@ impl RowFormat for Decoder {
     }
 
     fn missing(&self) -> Option<&'static str> {
-        self.open.is_some().then_some(NO_BYTES)
+        match self.open {
+            Some(_) => Some(NO_BYTES),
+            None => (!self.has_lines)
+                .then_some("lines of the component canbus, such as '[D][canbus:070]: received can message'"),
+        }
     }
 }
 

@@ -156,6 +156,9 @@ impl RowFormat for Decoder {
     }
 
     fn missing(&self) -> Option<&'static str> {
+        if self.buses.is_empty() {
+            return Some("fields of frames, such as 'can-1: Identifier: 291 (0x123)'");
+        }
         self.buses.iter().any(|bus| bus.open.is_some()).then_some("the end of the last frame")
     }
 }

@@ -20,6 +20,8 @@ pub(crate) struct Decoder {
     is_decimal: bool,
     /// To be reported before anything is read.
     untold: bool,
+    /// Whether there was a row on a CAN bus.
+    has_rows: bool,
 }
 
 const TAKEN_AS_DECIMAL: &str =
@@ -171,12 +173,19 @@ impl RowFormat for Decoder {
         }
         let words = words(line);
         match columns(&words, zone) {
-            Some(columns) => self.row(&columns, line),
+            Some(columns) => {
+                self.has_rows = true;
+                self.row(&columns, line)
+            }
             None if words.first().is_some_and(|word| time_of(word, zone).is_some()) => {
                 Ok(Line::LeftOut(OTHER_ROWS))
             }
             None => Ok(Line::LeftOut(SIGNALS)),
         }
+    }
+
+    fn missing(&self) -> Option<&'static str> {
+        (!self.has_rows).then_some("a row such as '0.010640 CAN 1 123 Rx 2 11 22'")
     }
 
     /// What was copied often ends without a line's end; a row says how many bytes it has, with two digits each.

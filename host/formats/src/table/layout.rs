@@ -323,7 +323,7 @@ impl Layout {
 fn is_clock(cell: &[u8]) -> bool {
     memchr::memchr_iter(b':', cell).count() == 2
         && cell.first().is_some_and(u8::is_ascii_digit)
-        && super::date(cell, &Zone::default()).is_some()
+        && super::time::date(cell, &Zone::default()).is_some()
 }
 
 /// Whether a cell is a day, `T`, and a time of day in digits: `31T135012345`.

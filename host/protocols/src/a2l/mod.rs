@@ -7,6 +7,7 @@ mod conversion;
 mod description;
 mod if_data;
 mod load;
+mod nesting;
 mod object;
 #[cfg(test)]
 mod tests;

@@ -1,14 +1,16 @@
 //! A drive (CiA 402) in motion: what it is told, and the state in which it is left, whatever happens.
 
+use std::cell::Cell;
 use std::fmt;
 use std::io;
+use std::rc::Rc;
 use std::time::Duration;
 
 use anyhow::{anyhow, bail};
 use cantap_protocols::active::drive::{DriveClient, DriveError, DriveStep, DriveTiming, DriveValues};
 use cantap_protocols::active::sdo::SdoError;
 use cantap_protocols::canopen::drive::{DriveState, error, mode_name, status_flags};
-use cantap_protocols::{Event, EventKind};
+use cantap_protocols::{EventKind, Party};
 
 use crate::advice::sentence;
 use crate::interrupt;
@@ -128,7 +130,7 @@ pub struct Drive<'s, 'd> {
     client: DriveClient,
     node: u8,
     /// The stamp of the last answer.
-    time_ns: i64,
+    time_ns: Rc<Cell<i64>>,
     states: Vec<DriveState>,
     /// It was told something, so that it may have to be stopped.
     is_commanded: bool,
@@ -144,7 +146,16 @@ impl<'s, 'd> Drive<'s, 'd> {
         on_status: OnStatus<'s>,
     ) -> Self {
         let client = DriveClient::new(node, timing);
-        Self { speaking, client, node, time_ns: 0, states: Vec::new(), is_commanded: false, on_status }
+        let time_ns = Rc::new(Cell::new(0));
+        let (last_ns, party) = (Rc::clone(&time_ns), Party::Node(node));
+        // A motion may last for days: what is said meanwhile is not kept.
+        speaking.show_as_it_comes(Box::new(move |event| {
+            if event.to == party && matches!(event.kind, EventKind::SdoRead | EventKind::SdoWrite) {
+                last_ns.set(event.time_ns);
+            }
+            event.from == party && matches!(event.kind, EventKind::Emergency | EventKind::BootUp)
+        }));
+        Self { speaking, client, node, time_ns, states: Vec::new(), is_commanded: false, on_status }
     }
 
     /// The last confirmed state.
@@ -160,25 +171,9 @@ impl<'s, 'd> Drive<'s, 'd> {
         self.is_commanded |= step != DriveStep::Inspect;
         self.client.begin(step);
         let ran = self.speaking.run(&mut self.client);
-        self.take_events()?;
+        self.states.extend(self.client.take_states());
         ran?;
         self.client.outcome().map_err(|error| self.explained(error))
-    }
-
-    /// Passes on what was heard of the drive, and notes when.
-    fn take_events(&mut self) -> io::Result<()> {
-        let node = cantap_protocols::Party::Node(self.node);
-        let mut last_ns = self.time_ns;
-        let is_wanted = |event: &Event| {
-            if event.to == node && matches!(event.kind, EventKind::SdoRead | EventKind::SdoWrite) {
-                last_ns = event.time_ns;
-            }
-            event.from == node && matches!(event.kind, EventKind::Emergency | EventKind::BootUp)
-        };
-        self.speaking.show(is_wanted)?;
-        self.time_ns = last_ns;
-        self.states.extend(self.client.take_states());
-        Ok(())
     }
 
     fn explained(&self, error: DriveError) -> anyhow::Error {
@@ -224,7 +219,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     fn pass_on(&mut self) -> anyhow::Result<()> {
         let status = DriveStatus {
             node: self.node,
-            time_ns: self.time_ns,
+            time_ns: self.time_ns.get(),
             states: std::mem::take(&mut self.states),
             values: *self.client.values(),
         };
@@ -379,8 +374,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     fn last_step(&mut self, step: DriveStep) -> anyhow::Result<()> {
         self.client.begin(step);
         let ran = self.speaking.run_last(&mut self.client);
-        // Whoever reads what is printed may be gone.
-        let _ = self.take_events();
+        self.states.extend(self.client.take_states());
         ran?;
         Ok(self.client.outcome()?)
     }

@@ -71,6 +71,6 @@ impl SpeakArgs {
             out.flush()
         };
         let recovery = self.channel_options().bus_off_recovery(&stderr::reporter());
-        Speaking::new(device, self.channel, recovery, witness, Box::new(print))
+        Speaking::new(device, self.channel, recovery, witness, Box::new(print), stderr::reporter())
     }
 }

@@ -255,9 +255,9 @@ fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()
     }
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
-    let (sent, verdict) = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
     let own = |event: &Event| matches!(event.kind, EventKind::Sync | EventKind::State);
-    speaking.show(own)?;
+    speaking.show_as_it_comes(Box::new(own));
+    let (sent, verdict) = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
     eprintln!("cantap: {} sent", were(sent));
     drop(speaking);
     device.stop()?;

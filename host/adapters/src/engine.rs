@@ -25,6 +25,7 @@ use heapless::String;
 use crate::board::{AdapterBoard, Filters, HostClock, NoChip, NoMeter, PipePort};
 use crate::driver::{At, Driver, Incoming};
 use crate::in_order::InOrder;
+use crate::loss_rows::LossRows;
 use crate::mailboxes::{ControlSide, Mailboxes, Phase, TrafficSide};
 
 /// Bytes on their way to the host, and to the device.
@@ -139,6 +140,7 @@ fn run(driver: Box<dyn Driver>, port: PipePort, reason: &Reason) {
         reports: VecDeque::new(),
         fresh: Vec::new(),
         order: InOrder::default(),
+        losses: LossRows::default(),
         unreported: VecDeque::new(),
         leaving_since: [None; CHANNELS],
         closed: [false; CHANNELS],
@@ -157,6 +159,7 @@ struct Engine<'q> {
     /// The driver's last reports, for a moment.
     fresh: Vec<Incoming>,
     order: InOrder,
+    losses: LossRows,
     /// Events that found no room in the record queue.
     unreported: VecDeque<(Event, u64)>,
     /// Since when a channel is being closed.
@@ -229,7 +232,10 @@ impl Engine<'_> {
     fn ask_driver(&mut self, wait: Duration) -> Option<std::string::String> {
         let ended = self.board.driver.poll(wait, &mut self.fresh).err();
         self.order.correct(&mut self.fresh);
-        self.reports.extend(self.fresh.drain(..));
+        self.losses.pass(&mut self.fresh, Instant::now(), &mut self.reports);
+        if ended.is_some() {
+            self.losses.flush(&mut self.reports);
+        }
         self.take_reports();
         ended
     }
@@ -359,6 +365,8 @@ impl Engine<'_> {
                 self.closed[channel.index()] = true;
                 // If it says why it ended, the next poll says so again.
                 let _ = self.ask_driver(Duration::ZERO);
+                self.losses.flush(&mut self.reports);
+                self.take_reports();
             }
             if since.elapsed() > DELIVER_WITHIN {
                 while let Some(incoming) = self.reports.pop_front() {

@@ -31,6 +31,7 @@ mod interface_name;
 mod kvaser;
 mod library_channel;
 mod line;
+mod loss_rows;
 mod mailboxes;
 mod maker_channels;
 mod maker_options;

@@ -321,6 +321,12 @@ impl Client {
             _ => None,
         };
         let result = self.carry_out(command);
+        if let Err(Refusal::NotGranted { needs }) = result
+            && self.role < needs
+        {
+            let reason = format!("it may {}, and asked for what needs the right to {needs}", self.role);
+            self.shared.tell(News::NotPermitted { client: self.name.clone(), reason });
+        }
         if let (Some(changes), Ok(_)) = (changes, &result) {
             self.shared.note(|| {
                 let mut noted = who(&self.name);

@@ -49,7 +49,7 @@ pub enum News {
         /// The time.
         after: Duration,
     },
-    /// A client's request was refused, because the permissions of its certificate do not cover it.
+    /// A client's request was refused, because its role does not allow it, or the permissions of its certificate do not cover it.
     NotPermitted {
         /// Its name.
         client: String,

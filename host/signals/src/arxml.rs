@@ -6,6 +6,7 @@
 mod containers;
 
 use std::collections::{HashMap, HashSet};
+use std::rc::Rc;
 
 use cantap_trace::counted;
 use roxmltree::{Document, Node};
@@ -14,6 +15,7 @@ use super::container::Container;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{self, ByteOrder};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::text_places::Lines;
 use super::unflagged::Unflagged;
 use super::{buses, validate, xml};
 
@@ -32,8 +34,8 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
         return Err(xml::faulty(file, reason));
     }
     let (by_path, faults, unflagged) = (HashMap::new(), Vec::new(), Unflagged::default());
-    let mut reader = Reader { document: &document, by_path, faults, unflagged };
-    reader.index(root);
+    let mut reader = Reader { document: &document, lines: Lines::of(&text), by_path, faults, unflagged };
+    reader.index(root).map_err(|reason| xml::faulty(file, reason.to_owned()))?;
     let triggerings = root.descendants().filter(|node| node.tag_name().name() == "CAN-FRAME-TRIGGERING");
     let triggerings: Vec<_> = triggerings.map(|node| (node, bus_of(node))).collect();
     let mut names: Vec<String> = Vec::new();
@@ -76,6 +78,7 @@ fn bus_of(triggering: Node<'_, '_>) -> String {
 
 struct Reader<'a> {
     document: &'a Document<'a>,
+    lines: Lines,
     /// Everything with a name, by its path.
     by_path: HashMap<String, Node<'a, 'a>>,
     faults: Vec<Fault>,
@@ -150,25 +153,31 @@ struct Target<'m> {
 /// Limits on the nesting of PDUs and on their number in a frame: a file can name a PDU as part of itself.
 const MOST_DEPTH: u32 = 8;
 const MOST_PDUS: u32 = 1000;
+/// How many bytes all paths may have together: of elements in elements, each has the names of all around it.
+const MOST_PATH_BYTES: usize = 256 << 20;
 
 impl<'a> Reader<'a> {
     /// Indexes everything below `node` by path.
-    fn index(&mut self, root: Node<'a, 'a>) {
-        let mut open = vec![(root, String::new())];
+    fn index(&mut self, root: Node<'a, 'a>) -> Result<(), &'static str> {
+        let (mut open, mut left) = (vec![(root, Rc::<str>::from(""))], MOST_PATH_BYTES);
         while let Some((node, path)) = open.pop() {
             for child in node.children().filter(Node::is_element) {
                 let name = child.children().find(|node| node.tag_name().name() == "SHORT-NAME");
                 let path = match name {
                     Some(name) => {
                         let path = format!("{path}/{}", xml::text(name).trim());
+                        left = left
+                            .checked_sub(2 * path.len())
+                            .ok_or("the paths of its elements come to more than 256 MiB")?;
                         self.by_path.insert(path.clone(), child);
-                        path
+                        path.into()
                     }
-                    None => path.clone(),
+                    None => Rc::clone(&path),
                 };
                 open.push((child, path));
             }
         }
+        Ok(())
     }
 
     /// The element that a reference below `node` points to.
@@ -177,7 +186,7 @@ impl<'a> Reader<'a> {
     }
 
     fn line(&self, node: Node<'_, '_>) -> u32 {
-        xml::line(self.document, node)
+        xml::line(&self.lines, node)
     }
 
     fn message(&mut self, triggering: Node<'a, 'a>) -> Option<Message> {

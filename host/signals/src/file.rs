@@ -13,6 +13,7 @@ use toml::Spanned;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::ByteOrder;
 use super::model::{Alarms, Colour, Database, Digital, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::text_places::Lines;
 use super::{layout, validate};
 
 /// The version of the format that this program reads.
@@ -147,34 +148,29 @@ struct AlarmEntry {
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     let faulty = |fault| DatabaseError::Faulty { file: file.to_owned(), faults: vec![fault] };
     let text = str::from_utf8(bytes).map_err(|error| {
-        let line = line_of(bytes, error.valid_up_to());
+        let line = Lines::of_bytes(bytes).line(error.valid_up_to());
         let kind = FaultKind::Syntax("a signal file is in UTF-8; this byte is not".to_owned());
         faulty(Fault { line, symbol: String::new(), kind })
     })?;
+    let lines = Lines::of_bytes(bytes);
     let content: File = toml::from_str(text).map_err(|error| {
-        let line = error.span().map_or(0, |span| line_of(bytes, span.start));
+        let line = error.span().map_or(0, |span| lines.line(span.start));
         let kind = FaultKind::Syntax(error.message().to_owned());
         faulty(Fault { line, symbol: symbol_at(text, line), kind })
     })?;
     if *content.version.get_ref() != VERSION {
-        let line = line_of(bytes, content.version.span().start);
+        let line = lines.line(content.version.span().start);
         let version = content.version.get_ref();
         let kind = FaultKind::Syntax(format!("this program reads version {VERSION}, the file has {version}"));
         return Err(faulty(Fault { line, symbol: "version".to_owned(), kind }));
     }
     let mut faults = Vec::new();
     let messages = content.message.into_iter().filter_map(|entry| {
-        let line = line_of(bytes, entry.span().start);
-        message(entry.into_inner(), line, bytes, &mut faults)
+        let line = lines.line(entry.span().start);
+        message(entry.into_inner(), line, &lines, &mut faults)
     });
     let messages = messages.collect();
     validate::finish_strictly(file, messages, faults)
-}
-
-fn line_of(bytes: &[u8], offset: usize) -> u32 {
-    let before = &bytes[..offset.min(bytes.len())];
-    // A signal file is small, and this runs only for errors and once per table.
-    before.split(|&byte| byte == b'\n').count() as u32
 }
 
 /// The message, or message and signal, in whose table a line is.
@@ -200,7 +196,7 @@ fn symbol_at(text: &str, line: u32) -> String {
     format!("{}.{name}", message.map_or("", |&(.., name)| name))
 }
 
-fn message(entry: MessageEntry, line: u32, bytes: &[u8], faults: &mut Vec<Fault>) -> Option<Message> {
+fn message(entry: MessageEntry, line: u32, lines: &Lines, faults: &mut Vec<Fault>) -> Option<Message> {
     let extended = entry.extended.unwrap_or(entry.id > u64::from(Id::MAX_STANDARD));
     let id = u32::try_from(entry.id).ok();
     let id = id.and_then(|id| if extended { Id::extended(id) } else { Id::standard(id) });
@@ -214,7 +210,7 @@ fn message(entry: MessageEntry, line: u32, bytes: &[u8], faults: &mut Vec<Fault>
     let mut signals = Vec::new();
     let mut conditions = Vec::new();
     for signal_entry in entry.signal {
-        let line = line_of(bytes, signal_entry.span().start);
+        let line = lines.line(signal_entry.span().start);
         let signal_entry = signal_entry.into_inner();
         let symbol = format!("{}.{}", entry.name, signal_entry.name);
         match signal(signal_entry, line) {

@@ -3,11 +3,12 @@
 //! For big-endian signals, a bit offset counts from the highest bit of the first byte. The file does not say which of its buses a
 //! channel is.
 
-use roxmltree::{Document, Node};
+use roxmltree::Node;
 
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{ByteOrder, wire_position};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::text_places::Lines;
 use super::unflagged::Unflagged;
 use super::{buses, validate, xml};
 
@@ -20,6 +21,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
 pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
+    let lines = Lines::of(&text);
     let root = document.root_element();
     if root.tag_name().name() != "NetworkDefinition" {
         let reason =
@@ -34,7 +36,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
     let mut ids = Vec::new();
     for (at, node) in nodes.iter().filter(|node| buses.contains(&name(node))).enumerate() {
         for node in node.children().filter(|node| node.has_tag_name_of("Message")) {
-            let message = message(&document, node, &mut unflagged, &mut faults);
+            let message = message(&lines, node, &mut unflagged, &mut faults);
             ids.extend(message.iter().map(|message| (message.id, at)));
             messages.extend(message);
         }
@@ -64,13 +66,8 @@ fn notes(node: Node) -> String {
     child(node, "Notes").map(|notes| xml::text(notes).trim().to_owned()).unwrap_or_default()
 }
 
-fn message(
-    document: &Document,
-    node: Node,
-    unflagged: &mut Unflagged,
-    faults: &mut Vec<Fault>,
-) -> Option<Message> {
-    let line = xml::line(document, node);
+fn message(lines: &Lines, node: Node, unflagged: &mut Unflagged, faults: &mut Vec<Fault>) -> Option<Message> {
+    let line = xml::line(lines, node);
     let name = node.attribute("name").unwrap_or_default().to_owned();
     let mut fault = |kind| faults.push(Fault { line, symbol: name.clone(), kind });
     let written = node.attribute("id").unwrap_or_default();
@@ -87,14 +84,14 @@ fn message(
     let mut signals = Vec::new();
     for part in node.children().filter(Node::is_element) {
         let result = match part.tag_name().name() {
-            "Signal" => signal(document, part).map(|signal| signals.push(signal)),
-            "Multiplex" => multiplex(document, part, &mut signals),
+            "Signal" => signal(lines, part).map(|signal| signals.push(signal)),
+            "Multiplex" => multiplex(lines, part, &mut signals),
             _ => Ok(()),
         };
         if let Err(kind) = result {
             let symbol = format!("{name}.{}", part.attribute("name").unwrap_or_default());
             let is_usable = kind.is_warning();
-            faults.push(Fault { line: xml::line(document, part), symbol, kind });
+            faults.push(Fault { line: xml::line(lines, part), symbol, kind });
             if !is_usable {
                 return None;
             }
@@ -115,9 +112,9 @@ fn message(
 }
 
 /// A multiplexer and the signals of its groups.
-fn multiplex(document: &Document, node: Node, signals: &mut Vec<Signal>) -> Result<(), FaultKind> {
+fn multiplex(lines: &Lines, node: Node, signals: &mut Vec<Signal>) -> Result<(), FaultKind> {
     let switch = signals.len();
-    signals.push(Signal { is_switch: true, ..signal(document, node)? });
+    signals.push(Signal { is_switch: true, ..signal(lines, node)? });
     for group in node.children().filter(|node| node.has_tag_name_of("MuxGroup")) {
         let written = group.attribute("count").unwrap_or_default();
         let value = xml::integer(written).and_then(|value| u64::try_from(value).ok());
@@ -125,13 +122,13 @@ fn multiplex(document: &Document, node: Node, signals: &mut Vec<Signal>) -> Resu
             .ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is not a number")))?;
         for part in group.children().filter(|node| node.has_tag_name_of("Signal")) {
             let multiplexed = Some(Multiplexed { switch, values: vec![value..=value] });
-            signals.push(Signal { multiplexed, ..signal(document, part)? });
+            signals.push(Signal { multiplexed, ..signal(lines, part)? });
         }
     }
     Ok(())
 }
 
-fn signal(document: &Document, node: Node) -> Result<Signal, FaultKind> {
+fn signal(lines: &Lines, node: Node) -> Result<Signal, FaultKind> {
     let number = |node: Node, name: &str, default: f64| match node.attribute(name) {
         None => Ok(default),
         Some(text) => text
@@ -153,7 +150,7 @@ fn signal(document: &Document, node: Node) -> Result<Signal, FaultKind> {
     let mut signal = Signal {
         description: notes(node),
         order,
-        line: xml::line(document, node),
+        line: xml::line(lines, node),
         ..Signal::new(name, start, length)
     };
     if let Some(value) = child(node, "Value") {

@@ -36,6 +36,7 @@ pub mod search;
 mod select;
 mod sheet;
 pub mod sym;
+pub mod text_places;
 pub mod trigger;
 mod unflagged;
 mod validate;

@@ -330,13 +330,15 @@ impl Reader {
 
     /// Combines blocks of the same name.
     fn messages(self, faults: &mut Vec<Fault>) -> Vec<Message> {
-        let mut groups: Vec<Vec<Block>> = Vec::new();
+        let (mut groups, mut names) = (Vec::<Vec<Block>>::new(), HashMap::<String, usize>::new());
         for block in self.blocks {
-            let same =
-                groups.iter_mut().rev().find(|group| group[0].name == block.name && block.ids.is_none());
-            match same {
-                Some(group) => group.push(block),
-                None => groups.push(vec![block]),
+            // A block without identifiers goes on with the last one of its name.
+            match names.get(&block.name).filter(|_| block.ids.is_none()) {
+                Some(at) => groups[*at].push(block),
+                None => {
+                    names.insert(block.name.clone(), groups.len());
+                    groups.push(vec![block]);
+                }
             }
         }
         let mut unflagged = Unflagged::default();

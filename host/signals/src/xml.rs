@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use roxmltree::{Document, Node, ParsingOptions};
 
 use super::fault::{DatabaseError, Fault, FaultKind};
+use super::text_places::{Lines, check_entities};
 
 /// A range of values with one text is expanded up to this many values.
 pub const MOST_TEXTS: i64 = 4096;
@@ -23,6 +24,7 @@ pub fn parse<'a>(file: &str, text: &'a str) -> Result<Document<'a>, DatabaseErro
             "the file is empty; is it the right one, and was it copied to its end?".to_owned(),
         ));
     }
+    check_entities(text).map_err(|error| faulty(file, error.to_string()))?;
     let options = ParsingOptions { allow_dtd: true, ..ParsingOptions::default() };
     Document::parse_with_options(text, options).map_err(|error| {
         let (line, kind) = (error.pos().row, FaultKind::Syntax(error.to_string()));
@@ -40,8 +42,8 @@ pub fn faulty(file: &str, reason: String) -> DatabaseError {
 }
 
 /// The line on which an element begins.
-pub fn line(document: &Document, node: Node) -> u32 {
-    document.text_pos_at(node.range().start).row
+pub fn line(lines: &Lines, node: Node) -> u32 {
+    lines.line(node.range().start)
 }
 
 /// All text inside an element.

@@ -19,7 +19,9 @@ pub fn vin(address: &str) -> Result<String, Box<dyn Error>> {
     let pair: Pair = "7E0:7E8".parse()?;
     let reader = Diagnostics::new(&[pair.into()], false);
     let recovery = BusOffRecovery::new(None, Reporter::silent());
-    let speaking = Speaking::new(&device, Channel::Can1, recovery, Box::new(reader), Box::new(|_| Ok(())));
+    let on_event = Box::new(|_: &_| Ok(()));
+    let speaking =
+        Speaking::new(&device, Channel::Can1, recovery, Box::new(reader), on_event, Reporter::silent());
     let options = TransferOptions::of_obd(pair, Duration::from_millis(150), false);
     let mut client = Client::new(speaking, options, Reporter::silent());
     let answer = uds::first(client.ask(&[0x22, 0xF1, 0x90])?)?;

@@ -23,6 +23,11 @@ fn bytes_of(path: &Path) -> anyhow::Result<Vec<u8>> {
     Ok(bytes)
 }
 
+/// The bytes of a file that another one names, which may be a stranger's: a pipe would be waited for, and a device might have no end.
+fn included(path: &Path) -> Option<Vec<u8>> {
+    path.metadata().is_ok_and(|there| there.is_file()).then(|| bytes_of(path).ok()).flatten()
+}
+
 /// Reads a file: a description for each ECU in it. How much of it is left out is reported.
 ///
 /// # Errors
@@ -33,7 +38,7 @@ pub fn read(path: &Path, reporter: &Reporter) -> anyhow::Result<Vec<Description>
     let bytes = bytes_of(path).with_context(|| format!("cannot read {name}"))?;
     // What a file includes is named from where it is.
     let folder = path.parent().unwrap_or(Path::new(""));
-    let mut include = |name: &str| bytes_of(&folder.join(name.replace('\\', "/"))).ok();
+    let mut include = |name: &str| included(&folder.join(name.replace('\\', "/")));
     let descriptions = Description::read(&bytes, &mut include).with_context(|| name.to_string())?;
     let issues: Vec<_> = descriptions.iter().flat_map(|one| &one.issues).map(String::as_str).collect();
     if !issues.is_empty() {

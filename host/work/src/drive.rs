@@ -2,8 +2,10 @@
 
 mod guard;
 
+use std::cell::Cell;
 use std::fmt;
 use std::io;
+use std::rc::Rc;
 use std::time::Duration;
 
 use anyhow::{anyhow, bail};
@@ -11,7 +13,7 @@ use cantap_protocols::active::drive::{DriveClient, DriveError, DriveStep, DriveT
 use cantap_protocols::active::heartbeat::HeartbeatProducer;
 use cantap_protocols::active::sdo::SdoError;
 use cantap_protocols::canopen::drive::{DriveState, error, mode_name, status_flags};
-use cantap_protocols::{Event, EventKind};
+use cantap_protocols::{EventKind, Party};
 
 pub use self::guard::Guard;
 use self::guard::{Guarded, run};
@@ -144,7 +146,9 @@ pub struct Drive<'s, 'd> {
     node: u8,
     axis: u8,
     /// The stamp of the last answer.
-    time_ns: i64,
+    time_ns: Rc<Cell<i64>>,
+    /// The nodes from which anything was heard: bit n is node n.
+    heard: Rc<Cell<u128>>,
     states: Vec<DriveState>,
     /// It was told something, so that it may have to be stopped.
     is_commanded: bool,
@@ -164,12 +168,26 @@ impl<'s, 'd> Drive<'s, 'd> {
         timing: DriveTiming,
         on_status: OnStatus<'s>,
     ) -> Self {
+        let client = DriveClient::new(node, timing).with_axis(axis);
+        let (time_ns, heard) = (Rc::new(Cell::new(0)), Rc::new(Cell::new(0)));
+        let (last_ns, senders, party) = (Rc::clone(&time_ns), Rc::clone(&heard), Party::Node(node));
+        // A motion may last for days: what is said meanwhile is not kept.
+        speaking.show_as_it_comes(Box::new(move |event| {
+            if let Party::Node(number @ 0..=127) = event.from {
+                senders.set(senders.get() | 1_u128 << number);
+            }
+            if event.to == party && matches!(event.kind, EventKind::SdoRead | EventKind::SdoWrite) {
+                last_ns.set(event.time_ns);
+            }
+            event.from == party && matches!(event.kind, EventKind::Emergency | EventKind::BootUp)
+        }));
         Self {
             speaking,
-            client: DriveClient::new(node, timing).with_axis(axis),
+            client,
             node,
             axis,
-            time_ns: 0,
+            time_ns,
+            heard,
             states: Vec::new(),
             is_commanded: false,
             answer_ns: timing.answer_ns,
@@ -192,25 +210,9 @@ impl<'s, 'd> Drive<'s, 'd> {
         self.is_commanded |= step != DriveStep::Inspect;
         self.client.begin(step);
         let ran = run(self.speaking, self.heartbeat.as_mut(), &mut self.client, false);
-        self.take_events()?;
+        self.states.extend(self.client.take_states());
         ran?;
         self.client.outcome().map_err(|error| self.explained(error))
-    }
-
-    /// Passes on what was heard of the drive, and notes when.
-    fn take_events(&mut self) -> io::Result<()> {
-        let node = cantap_protocols::Party::Node(self.node);
-        let mut last_ns = self.time_ns;
-        let is_wanted = |event: &Event| {
-            if event.to == node && matches!(event.kind, EventKind::SdoRead | EventKind::SdoWrite) {
-                last_ns = event.time_ns;
-            }
-            event.from == node && matches!(event.kind, EventKind::Emergency | EventKind::BootUp)
-        };
-        self.speaking.show(is_wanted)?;
-        self.time_ns = last_ns;
-        self.states.extend(self.client.take_states());
-        Ok(())
     }
 
     fn explained(&self, error: DriveError) -> anyhow::Error {
@@ -257,7 +259,7 @@ impl<'s, 'd> Drive<'s, 'd> {
         let status = DriveStatus {
             node: self.node,
             axis: self.axis,
-            time_ns: self.time_ns,
+            time_ns: self.time_ns.get(),
             states: std::mem::take(&mut self.states),
             values: *self.client.values(),
         };
@@ -413,8 +415,7 @@ impl<'s, 'd> Drive<'s, 'd> {
     fn last_step(&mut self, step: DriveStep) -> anyhow::Result<()> {
         self.client.begin(step);
         let ran = run(self.speaking, self.heartbeat.as_mut(), &mut self.client, true);
-        // Whoever reads what is printed may be gone.
-        let _ = self.take_events();
+        self.states.extend(self.client.take_states());
         ran?;
         Ok(self.client.outcome()?)
     }

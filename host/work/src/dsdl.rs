@@ -14,8 +14,9 @@ use crate::report::Reporter;
 const SUBJECTS: u16 = 8192;
 /// How many files of definitions a folder may have.
 const MOST_FILES: usize = 20_000;
-/// How long one may be, in bytes.
+/// How long one may be, and all of them together, in bytes.
 const MOST_BYTES: u64 = 1 << 20;
+const MOST_TOGETHER_BYTES: u64 = 64 << 20;
 
 /// A subject of Cyphal and the data type of its messages.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -42,9 +43,10 @@ impl FromStr for SubjectType {
 ///
 /// # Errors
 ///
-/// Whatever keeps a folder or a definition from being read; more than 20 000 of them, or one of more than 1 MiB.
+/// Whatever keeps a folder or a definition from being read; more than 20 000 of them, one of more than 1 MiB, or more than 64 MiB in all.
 pub fn read_folder(folder: &Path) -> io::Result<Vec<DsdlSource>> {
     let (mut sources, mut folders) = (Vec::new(), vec![(folder.to_owned(), String::new())]);
+    let mut left = MOST_TOGETHER_BYTES;
     while let Some((folder, namespace)) = folders.pop() {
         for entry in std::fs::read_dir(&folder)? {
             let entry = entry?;
@@ -53,10 +55,13 @@ pub fn read_folder(folder: &Path) -> io::Result<Vec<DsdlSource>> {
             if kind.is_dir() && !name.starts_with('.') {
                 folders.push((entry.path(), format!("{path}/")));
             } else if kind.is_file() && DsdlSource::has_name(&name) {
-                if sources.len() == MOST_FILES || entry.metadata()?.len() > MOST_BYTES {
+                let length = entry.metadata()?.len();
+                let is_taken = sources.len() < MOST_FILES && length <= MOST_BYTES && length <= left;
+                if !is_taken {
                     let what = format!("{}: too many or too long definitions", entry.path().display());
                     return Err(io::Error::other(what));
                 }
+                left -= length;
                 let text = String::from_utf8_lossy(&std::fs::read(entry.path())?).into_owned();
                 sources.push(DsdlSource { path, text });
             }

@@ -21,6 +21,7 @@ use crate::bus_hints::{BusHint, HintPlace};
 use crate::bus_off::BusOffRecovery;
 use crate::interrupt;
 use crate::reception::Reception;
+use crate::report::Reporter;
 use crate::sending::Sending;
 
 /// The longest time between two checks of what is being sent, and of Ctrl-C.
@@ -29,6 +30,8 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 const FAREWELL: Duration = Duration::from_millis(200);
 /// The device's slot for repeated frames.
 const REPEAT_SLOT: u8 = 0;
+/// How many events wait to be asked for. Whoever floods the bus while a node takes its time would otherwise fill the memory.
+const MOST_EVENTS: usize = 1 << 16;
 
 /// What was on the bus since the last request.
 #[derive(Clone, Copy, Debug, Default)]
@@ -59,7 +62,15 @@ pub struct Speaking<'d> {
     /// Frames not yet confirmed.
     under_way: VecDeque<Frame>,
     witness: Box<dyn Assembler>,
-    events: Vec<Event>,
+    /// What the bus's reader has just found.
+    found: Vec<Event>,
+    events: VecDeque<Event>,
+    /// Events that were not asked for before there was no more room.
+    left_out: u64,
+    as_it_comes: Option<IsWanted<'d>>,
+    /// What leaves a machine as it must be left.
+    is_last: bool,
+    reporter: Reporter,
     traffic: Traffic,
     reception: Reception,
     /// Any frame of others, since the beginning.
@@ -72,6 +83,9 @@ pub struct Speaking<'d> {
 /// Takes events for the user.
 pub type OnEvent<'d> = Box<dyn FnMut(&Event) -> io::Result<()> + 'd>;
 
+/// Chooses events.
+pub type IsWanted<'d> = Box<dyn FnMut(&Event) -> bool + 'd>;
+
 impl<'d> Speaking<'d> {
     /// Starts talking over the device, on its open `channel`. `witness` is the reader that finds the events in what was on the bus.
     pub fn new(
@@ -80,6 +94,7 @@ impl<'d> Speaking<'d> {
         recovery: BusOffRecovery,
         witness: Box<dyn Assembler>,
         on_event: OnEvent<'d>,
+        reporter: Reporter,
     ) -> Self {
         let open = device.open_channels().into_iter().find(|(open, _)| *open == channel);
         let clock_hz = device.hello().can_clock_hz;
@@ -94,7 +109,12 @@ impl<'d> Speaking<'d> {
             pushed: 0,
             under_way: VecDeque::new(),
             witness,
-            events: Vec::new(),
+            found: Vec::new(),
+            events: VecDeque::new(),
+            left_out: 0,
+            as_it_comes: None,
+            is_last: false,
+            reporter,
             traffic: Traffic::default(),
             reception: Reception::default(),
             has_received: false,
@@ -117,22 +137,39 @@ impl<'d> Speaking<'d> {
         self.device
     }
 
-    /// The events from the bus's reader since the last call.
+    /// The events from the bus's reader since the last call, the newest 65 536 at most. How many more there were is reported.
     pub fn take_events(&mut self) -> Vec<Event> {
-        std::mem::take(&mut self.events)
+        self.tell_left_out();
+        std::mem::take(&mut self.events).into()
     }
 
     /// Puts back what [`Self::take_events`] returned.
     pub fn put_back(&mut self, events: Vec<Event>) {
-        self.events = events;
+        self.events = events.into();
     }
 
-    /// Passes on the wanted events from the bus's reader since the last call.
+    /// Passes on the wanted ones of the events that [`Self::take_events`] would return.
     pub fn show(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> io::Result<()> {
+        self.tell_left_out();
         for event in self.events.drain(..).filter(|event| is_wanted(event)) {
             (self.on_event)(&event)?;
         }
         Ok(())
+    }
+
+    /// Passes on the wanted events as soon as they are there, and keeps no others: for what goes on for as long as the user wants.
+    pub fn show_as_it_comes(&mut self, is_wanted: IsWanted<'d>) {
+        self.as_it_comes = Some(is_wanted);
+    }
+
+    fn tell_left_out(&mut self) {
+        let left_out = usize::try_from(std::mem::take(&mut self.left_out)).unwrap_or(usize::MAX);
+        if left_out > 0 {
+            self.reporter.warn(format!(
+                "more was said on the bus meanwhile than is kept: {} before the newest {MOST_EVENTS} left out",
+                counted(left_out, "message")
+            ));
+        }
     }
 
     /// Runs a client until it ends. An error means that frames are stuck, the device is gone, or Ctrl-C; the client itself has
@@ -149,6 +186,7 @@ impl<'d> Speaking<'d> {
     /// Runs a client that leaves a machine as it must be left, after Ctrl-C, too, and whatever else was the reason.
     pub fn run_last(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
         self.sending.begin_farewell();
+        self.is_last = true;
         self.run_to_its_end(machine)
     }
 
@@ -285,11 +323,23 @@ impl<'d> Speaking<'d> {
             }
         }
         self.records.recycle(batch);
+        if let Some(mut is_wanted) = self.as_it_comes.take() {
+            let shown = self.show(&mut is_wanted);
+            self.as_it_comes = Some(is_wanted);
+            // A machine is stopped whether or not whoever reads what is printed is still there.
+            if !self.is_last {
+                shown?;
+            }
+        }
         Ok(())
     }
 
     fn record(&mut self, record: &TraceRecord, machine: Option<&mut dyn Machine>) {
-        self.witness.take(record, &mut self.events);
+        self.witness.take(record, &mut self.found);
+        self.events.extend(self.found.drain(..));
+        let excess = self.events.len().saturating_sub(MOST_EVENTS);
+        self.events.drain(..excess);
+        self.left_out += excess as u64;
         let now_ns = self.now_ns();
         match record.event {
             TraceEvent::Frame { frame, .. } => {

@@ -8,6 +8,7 @@ use super::conversion::{Conversion, Texts};
 use super::description::Description;
 use super::formula::Formula;
 use super::if_data::EcuConnection;
+use super::nesting::{TooDeep, bounded};
 use super::object::{Bits, DataType, MemoryObject};
 use crate::calibration::parts::ByteOrder;
 
@@ -28,6 +29,9 @@ pub enum A2lError {
     /// With all that it includes, it is too large.
     #[error("with what it includes, it is larger than 512 MiB")]
     TooLarge,
+    /// Its blocks are in each other deeper than in any file of a tool.
+    #[error("more than 64 of its blocks are in each other; is it damaged?")]
+    TooDeep,
     /// It is no A2L.
     #[error("it is no A2L file: {0}")]
     Malformed(String),
@@ -44,10 +48,14 @@ impl Description {
     ///
     /// # Errors
     ///
-    /// It is no A2L, or larger than 512 MiB.
+    /// It is no A2L, larger than 512 MiB, or has blocks in each other that are too deep.
     pub fn read(bytes: &[u8], include: &mut Include<'_>) -> Result<Vec<Self>, A2lError> {
         let mut issues = Vec::new();
         let text = expanded(&decode(bytes), include, (0, &mut 0), &mut issues)?;
+        let (text, without_grammar) = bounded(text).map_err(|TooDeep| A2lError::TooDeep)?;
+        if without_grammar {
+            issues.push("its A2ML, which comes to more than is read, is left out".to_owned());
+        }
         match a2lfile::load_from_string(&text, None, false) {
             Ok((file, _)) => of_file(&file, &issues),
             Err(error) => Self::parse_bare(&text, &format!("without its A2ML: {error}"), issues),
@@ -123,9 +131,13 @@ fn expanded(
     issues: &mut Vec<String>,
 ) -> Result<String, A2lError> {
     let (mut out, mut rest) = (String::with_capacity(text.len()), text);
-    let next = |rest: &str| [rest.find("/include"), rest.find("/INCLUDE")].into_iter().flatten().min();
+    let is_next = |rest: &[u8]| rest.starts_with(b"/include") || rest.starts_with(b"/INCLUDE");
+    let next =
+        |rest: &str| rest.match_indices('/').map(|(at, _)| at).find(|at| is_next(&rest.as_bytes()[*at..]));
     while let Some(at) = next(rest) {
         out.push_str(&rest[..at]);
+        // What stands on both sides of it is not to become another one.
+        out.push(' ');
         let after = rest[at + "/include".len()..].trim_start();
         let (name, behind) = match after.strip_prefix('"') {
             Some(quoted) => quoted.split_once('"').unwrap_or((quoted, "")),
@@ -137,6 +149,7 @@ fn expanded(
         match is_one_more.then(|| include(name)).flatten() {
             Some(bytes) => {
                 out.push_str(&expanded(&decode(&bytes), include, (depth + 1, included), issues)?);
+                out.push(' ');
             }
             None if issues.len() < MOST_ISSUES => {
                 issues.push(shown(&format!("{name}, which it includes, is left out")));

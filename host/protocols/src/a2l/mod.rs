@@ -8,6 +8,7 @@ mod description;
 mod formula;
 mod if_data;
 mod load;
+mod nesting;
 mod object;
 #[cfg(test)]
 mod tests;

@@ -139,3 +139,34 @@ fn a_description_is_that_of_its_identifiers() {
     let all = A2lDescriptions::new(bare.into_iter().map(Into::into).collect());
     assert!(all.of("7F0:7F1".parse().unwrap()).is_some(), "the only one, which says nothing else");
 }
+
+/// A file of two million such lines took hours, and each looked at all that came behind it.
+#[test]
+fn what_includes_without_end_is_read_in_a_time_that_grows_with_it() {
+    let many = format!("{ECU}{}", "/include x\n".repeat(200_000));
+    assert_eq!(Description::parse(&many).unwrap()[0].objects().len(), ecu().objects().len());
+    // The two parts of a word are not joined to another one, which the parser would follow by itself.
+    let split = ECU.replace("/begin MOD_COMMON", "/in/include \"\"clude \"/dev/zero\" /begin MOD_COMMON");
+    assert!(Description::parse(&split).is_err());
+}
+
+#[test]
+fn blocks_in_blocks_and_types_in_types_do_not_use_up_the_stack() {
+    let deep = ECU.replace(
+        "/begin IF_DATA Maker",
+        &format!("{}/begin IF_DATA Maker", "/begin IF_DATA X ".repeat(200_000)),
+    );
+    assert_eq!(Description::parse(&deep).unwrap_err(), A2lError::TooDeep);
+    let doubled: String =
+        (1..40).map(|at| format!("struct a{at} {{ struct a{0}; struct a{0}; }};", at - 1)).collect();
+    for grammar in [format!("struct a0 {{ uchar; }}; {doubled}"), "struct { ".repeat(200_000)] {
+        let text =
+            ECU.replace("/begin MOD_COMMON", &format!("/begin A2ML {grammar} /end A2ML /begin MOD_COMMON"));
+        let description = Description::parse(&text).unwrap().remove(0);
+        assert!(
+            description.issues[0].contains("A2ML") && description.xcp() == ecu().xcp(),
+            "{:?}",
+            description.issues
+        );
+    }
+}

@@ -1,5 +1,7 @@
 //! All definitions of one language, found by name and by number.
 
+use std::cell::RefCell;
+
 use rustc_hash::FxHashMap;
 
 use super::expression::evaluate;
@@ -52,6 +54,10 @@ struct Building<'a> {
     generation: Generation,
     raws: &'a [Raw],
     names: &'a FxHashMap<String, usize>,
+    /// The names and expressions of constants, by the definition that they are in and their name.
+    constants: FxHashMap<(usize, &'a str), (&'a str, &'a str)>,
+    /// The values of those that were needed: a constant that names two others twice, and they others, is a short text and many ways.
+    values: RefCell<FxHashMap<(usize, &'a str), i128>>,
 }
 
 impl Library {
@@ -68,7 +74,14 @@ impl Library {
                 Err(problem) => problems.push(problem),
             }
         }
-        let building = Building { generation, raws: &raws, names: &names };
+        let mut constants = FxHashMap::default();
+        for (at, raw) in raws.iter().enumerate() {
+            for (name, expression) in raw.sections.iter().flat_map(|section| &section.constants) {
+                constants.entry((at, name.as_str())).or_insert((name.as_str(), expression.as_str()));
+            }
+        }
+        let building =
+            Building { generation, raws: &raws, names: &names, constants, values: RefCell::default() };
         let mut definitions: Vec<Option<Definition>> = raws.iter().map(|_| None).collect();
         for at in 0..raws.len() {
             if let Err(problem) = building.define(at, &mut definitions, 0) {
@@ -259,9 +272,14 @@ impl Building<'_> {
                 Some((of, constant)) => (*self.names.get(&self.full_name(at, of))?, constant),
                 None => (at, name),
             };
-            let mut constants = self.raws[of].sections.iter().flat_map(|section| &section.constants);
-            let (_, expression) = constants.find(|(name, _)| name == constant)?;
-            self.evaluate(of, expression, depth + 1)
+            let (name, expression) = *self.constants.get(&(of, constant))?;
+            if let Some(known) = self.values.borrow().get(&(of, name)) {
+                return Some(*known);
+            }
+            // What has no value ends everything that it is part of.
+            let value = self.evaluate(of, expression, depth + 1)?;
+            self.values.borrow_mut().insert((of, name), value);
+            Some(value)
         })
     }
 }
@@ -297,7 +315,7 @@ fn least_bits(section: &Section, done: &[Option<Definition>]) -> u32 {
     let all = section.members.iter().map(|member| of(&member.kind));
     if section.is_union {
         let tag = bits_for(section.members.len().saturating_sub(1).max(1) as u32);
-        return all.min().unwrap_or_default() + u32::from(tag);
+        return all.min().unwrap_or_default().saturating_add(tag.into());
     }
     all.fold(0, u32::saturating_add)
 }

@@ -1,31 +1,29 @@
 //! What values mean, by the constants of their definition: `HEALTH_OK = 0` for a field `health`.
 
+use rustc_hash::{FxHashMap, FxHashSet};
+
 use super::model::{Kind, Member};
 
 /// Gives the constants to the fields whose values they are: by the beginning of their names, or all to the only field.
 pub fn assign(members: &mut [Member], constants: &[(String, i64)]) {
     let can_have = |member: &Member| matches!(scalar(&member.kind), Kind::Unsigned(_) | Kind::Signed(_));
-    let named = members.iter().filter(|member| !member.name.is_empty()).count();
+    let numbers = || members.iter().enumerate().filter(|(_, member)| can_have(member));
+    let is_only = members.iter().filter(|member| !member.name.is_empty()).count() == 1;
+    let only = numbers().next().map(|(at, _)| at).filter(|_| is_only);
+    let stems: FxHashMap<String, usize> = numbers()
+        .flat_map(|(at, member)| stems(&member.name).into_iter().map(move |stem| (stem, at)))
+        .collect();
+    let mut known: FxHashSet<(usize, i64)> = FxHashSet::default();
     for (name, value) in constants {
         if is_limit(name) {
             continue;
         }
-        let beginnings = members.iter().enumerate().filter(|(_, member)| can_have(member));
-        let best = beginnings.filter_map(|(at, member)| {
-            let stem = stems(&member.name).into_iter().find(|stem| name.starts_with(&**stem))?;
-            Some((stem.len(), at))
-        });
-        let (skipped, at) = match best.max_by_key(|(length, _)| *length) {
-            Some(best) => best,
-            None if named == 1 => match members.iter().position(can_have) {
-                Some(at) => (0, at),
-                None => continue,
-            },
-            None => continue,
-        };
-        let member = &mut members[at];
-        if member.meanings.iter().all(|(known, _)| known != value) {
-            member.meanings.push((*value, name[skipped..].to_lowercase()));
+        // The longest beginning that is one of a field.
+        let mut beginnings = name.rmatch_indices('_').map(|(at, _)| at + 1);
+        let best = beginnings.find_map(|end| Some((end, *stems.get(&name[..end])?)));
+        let Some((skipped, at)) = best.or_else(|| Some((0, only?))) else { continue };
+        if known.insert((at, *value)) {
+            members[at].meanings.push((*value, name[skipped..].to_lowercase()));
         }
     }
     for member in members {

@@ -13,7 +13,7 @@ use crate::{Bytes, Field, Value};
 
 /// How many values of one message are shown.
 const MOST_FIELDS: usize = 2048;
-/// How many elements of one message are read: those of no length would never end.
+/// How many elements and fields of one message are read: those of no length would never end, and types in types that have none come to as many.
 const MOST_ELEMENTS: usize = 100_000;
 /// How deep types may be nested; a library has none that are deeper.
 const MOST_DEPTH: u8 = 32;
@@ -98,6 +98,7 @@ impl Reader<'_> {
         path: &mut String,
         depth: u8,
     ) -> Result<(), Unread> {
+        self.read_elements(1)?;
         let before = path.len();
         if !path.is_empty() && !member.name.is_empty() {
             path.push('.');

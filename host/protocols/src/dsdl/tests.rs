@@ -150,3 +150,40 @@ fn anything_is_taken() {
         }
     }
 }
+
+/// Files of a few kilobytes that come to more than any computer does: each of them took hours, or ended the program.
+#[test]
+fn definitions_of_strangers_are_read_in_a_time_that_grows_with_them() {
+    // Each constant names the next one ten times.
+    let next = |at: u32| vec![format!("A{}", at + 1); 10].join(" + ");
+    let constants: String = (0..14).map(|at| format!("uint16 A{at} = {}\n", next(at))).collect();
+    let (library, problems) =
+        of(Generation::DroneCan, &[("a/100.B.uavcan", &format!("{constants}uint16 A14 = 1\nuint8[A9] x\n"))]);
+    assert_eq!(problems, [""; 0]);
+    assert_eq!(
+        library.named("a.B").unwrap().request.members[0].kind,
+        model::Kind::Array(model::Kind::Unsigned(8).into(), model::Size::Fixed(100_000))
+    );
+    // Arrays of arrays, in a union.
+    let arrays = [
+        ("a/A.uavcan", "uint64[1048576] x\n"),
+        ("a/B.uavcan", "A[1048576] x\n"),
+        ("a/100.C.uavcan", "@union\nB x\nB y\n"),
+    ];
+    assert_eq!(of(Generation::DroneCan, &arrays).1, [""; 0]);
+    // Many constants beside many fields.
+    let many: String = (0..30_000).map(|at| format!("uint16 F{at}_A = {at}\nuint16 f{at}\n")).collect();
+    let (library, _) = of(Generation::DroneCan, &[("a/100.B.uavcan", &many)]);
+    assert_eq!(library.named("a.B").unwrap().request.members[29_999].meanings, [(29_999, "a".to_owned())]);
+    // Types in types, of which the innermost has no length.
+    let inner = |at: u32| {
+        (0..30).map(|field| format!("T{}.1.0 f{field}\n", at + 1)).collect::<String>() + "@sealed\n"
+    };
+    let mut sources: Vec<_> = (0..12).map(|at| (format!("a/T{at}.1.0.dsdl"), inner(at))).collect();
+    sources.push(("a/T12.1.0.dsdl".to_owned(), "@sealed\n".to_owned()));
+    let sources: Vec<_> = sources.iter().map(|(path, text)| (path.as_str(), text.as_str())).collect();
+    let (library, problems) = of(Generation::Cyphal, &sources);
+    assert_eq!(problems, [""; 0]);
+    let outermost = &library.named("a.T0.1.0").unwrap().request;
+    assert!(read::read(&library, outermost, &[0; 8], false, "", &mut Vec::new()).is_err());
+}

@@ -18,6 +18,8 @@ use super::xml;
 const DEEPEST: usize = 16;
 /// Values of a message: a field of one bit each would be no more in the longest one that is kept.
 const MOST_VALUES: usize = 32_768;
+/// Parameters of a message, with those in its structures: those without a value would be no fewer the deeper they are in each other.
+const MOST_PARAMS: usize = 4 * MOST_VALUES;
 
 /// A value of a message.
 #[derive(Clone, Debug, PartialEq)]
@@ -80,6 +82,7 @@ pub fn read(model: &Model, view: &View, params: &[Param], data: &[u8], request: 
         path: String::new(),
         depth: 0,
         left: MOST_VALUES,
+        params_left: MOST_PARAMS,
     };
     let stop = reader.params(params).err();
     let stop = stop.map(|stop| (std::mem::take(&mut reader.path), stop));
@@ -110,12 +113,17 @@ struct Reader<'a> {
     path: String,
     depth: usize,
     left: usize,
+    params_left: usize,
 }
 
 impl<'a> Reader<'a> {
     fn params(&mut self, params: &'a [Param]) -> Result<(), Stop> {
         let before = std::mem::replace(&mut self.origin, self.cursor);
         for param in params {
+            self.params_left = self
+                .params_left
+                .checked_sub(1)
+                .ok_or_else(|| Stop::not_evaluated("more parameters than are read"))?;
             let length = self.path.len();
             if length > 0 {
                 self.path.push('.');

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::error::OdxError;
 use super::model::{Comparam, DopKind, Item, Layer, Link, Model, Name, OdxDtc, ServiceEntry, Target};
@@ -89,9 +89,9 @@ impl Model {
         let mut dops: Vec<_> = view.dops.iter().collect();
         dops.sort();
         let mut all = BTreeMap::new();
-        for (_, dop) in dops {
-            self.add_dtcs(*dop, 0, &mut all);
-        }
+        self.each_dtc(dops.into_iter().map(|(_, dop)| *dop), |code, dtc| {
+            all.entry(code).or_insert_with(|| dtc.clone());
+        });
         all
     }
 
@@ -102,30 +102,36 @@ impl Model {
         {
             return Some(dtc.clone());
         }
-        let mut all = BTreeMap::new();
-        self.add_dtcs(dop, 0, &mut all);
-        all.remove(&code)
+        let mut found = None;
+        self.each_dtc([dop].into_iter(), |of, dtc| {
+            if of == code {
+                found.get_or_insert(dtc);
+            }
+        });
+        found.cloned()
     }
 
-    fn add_dtcs(&self, dop: u32, depth: usize, all: &mut BTreeMap<u32, OdxDtc>) {
-        let DopKind::Dtcs(dtcs) = &self.dops[dop as usize].kind else { return };
-        for (code, dtc) in &dtcs.codes {
-            all.entry(*code).or_insert_with(|| dtc.clone());
-        }
-        if depth == DEEPEST {
-            return;
-        }
-        for other in &dtcs.others {
-            match self.item(*other) {
-                Some(Item::Dop(other)) => self.add_dtcs(other, depth + 1, all),
-                Some(Item::Dtc(dop, code)) => {
-                    if let DopKind::Dtcs(of) = &self.dops[dop as usize].kind
-                        && let Some(dtc) = of.codes.get(&code)
-                    {
-                        all.entry(code).or_insert_with(|| dtc.clone());
-                    }
+    /// The codes of types, each followed by those that it includes: each type once, however often and in which circles they include each other.
+    fn each_dtc<'a>(
+        &'a self,
+        dops: impl DoubleEndedIterator<Item = u32>,
+        mut take: impl FnMut(u32, &'a OdxDtc),
+    ) {
+        let mut left: Vec<Item> = dops.rev().map(Item::Dop).collect();
+        let mut seen = FxHashSet::default();
+        while let Some(item) = left.pop() {
+            let (dop, only) = match item {
+                Item::Dop(dop) if seen.insert(dop) => (dop, None),
+                Item::Dtc(dop, code) => (dop, Some(code)),
+                _ => continue,
+            };
+            let DopKind::Dtcs(dtcs) = &self.dops[dop as usize].kind else { continue };
+            match only {
+                Some(code) => dtcs.codes.get(&code).into_iter().for_each(|dtc| take(code, dtc)),
+                None => {
+                    dtcs.codes.iter().for_each(|(code, dtc)| take(*code, dtc));
+                    left.extend(dtcs.others.iter().rev().filter_map(|other| self.item(*other)));
                 }
-                _ => {}
             }
         }
     }

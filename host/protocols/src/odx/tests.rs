@@ -302,6 +302,49 @@ fn entities_do_not_explode() {
     let _ = read_text(&deep);
 }
 
+/// Documents of some kilobytes that come to more than any computer does: each of them took hours.
+#[test]
+fn documents_of_strangers_are_read_in_a_time_that_grows_with_them() {
+    // One entity, often.
+    let entity = format!("<!DOCTYPE ODX [<!ENTITY a \"{}\">]>", "a".repeat(100_000));
+    let text = format!("{entity}{}", document("", &format!("<DESC>{}</DESC>", "&a;".repeat(100_000))));
+    assert!(matches!(read_text(&text), Err(OdxError::Xml { .. })));
+    // Structures in structures, of which the innermost has nothing in it.
+    let param = |of: u32, at: u32| {
+        format!("<PARAM xsi:type=\"VALUE\"><SHORT-NAME>p{at}</SHORT-NAME><DOP-REF ID-REF=\"s{of}\"/></PARAM>")
+    };
+    let structure = |id: &str, params: String| {
+        format!("<STRUCTURE ID=\"{id}\"><SHORT-NAME>{id}</SHORT-NAME><PARAMS>{params}</PARAMS></STRUCTURE>")
+    };
+    let params = |of: u32| (0..30).map(|at| param(of, at)).collect::<String>();
+    let inner: String = (1..12).map(|at| structure(&format!("s{at}"), params(at + 1))).collect();
+    let all = structure("d", params(1)) + &inner + &structure("s12", String::new());
+    let read = reading(&document(&format!("<STRUCTURES>{all}</STRUCTURES>"), &service()), &[0x62, 1, 2]);
+    assert!(matches!(&read.stop, Some((_, Stop::NotEvaluated(_)))), "{:?}", read.stop);
+    // Types of trouble codes that include each other, thirty times each.
+    let linked =
+        |to: u32| format!("<LINKED-DTC-DOP><DTC-DOP-REF ID-REF=\"d{to}\"/></LINKED-DTC-DOP>").repeat(30);
+    let codes = |at: u32| {
+        format!(
+            "<DTC-DOP ID=\"d{at}\"><SHORT-NAME>d{at}</SHORT-NAME>{U8}<DTCS><DTC><SHORT-NAME>c{at}</SHORT-NAME><TROUBLE-CODE>{at}</TROUBLE-CODE></DTC></DTCS>\
+             <LINKED-DTC-DOPS>{}</LINKED-DTC-DOPS></DTC-DOP>",
+            linked((at + 1) % 16)
+        )
+    };
+    let all: String = (0..16).map(codes).collect();
+    let odx =
+        read_text(&document(&format!("<DTC-DOPS>{all}</DTC-DOPS>"), &service().replace("\"d\"", "\"d3\"")))
+            .unwrap();
+    let ecu = odx.ecu("ECU").unwrap();
+    assert_eq!((ecu.trouble_codes().len(), ecu.trouble_code(9).as_deref()), (16, Some("c9")));
+    let response = ecu.describe(Some(&[0x22, 1]), Some(&[0x62, 1, 1])).unwrap().response.unwrap();
+    let shown = &response.values.last().unwrap().value;
+    assert!(
+        matches!(shown, Physical::Meaning(_, text) if text == "c1"),
+        "a code of a type that is included: {shown:?}"
+    );
+}
+
 #[test]
 fn encodings_are_those_that_are_declared() {
     let text = |declaration: &str| {

@@ -289,16 +289,24 @@ fn the_record_has_who_did_what() {
     let path = folder.path().join("audit");
     let audit = Arc::new(Audit::open(&path, |text| panic!("{text}")).unwrap());
     served.board.record_to(Arc::clone(&audit));
-    served.permit("[clients.alice]\nsend = [\"123\"]");
-    let alice = Keys::in_folder(folder.path()).unwrap().add_client("alice", Role::Send).unwrap();
+    served.permit("[clients.alice]\nsend = [\"123\"]\n[clients.bob]\n");
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let alice = keys.add_client("alice", Role::Send).unwrap();
+    let bob = keys.add_client("bob", Role::Listen).unwrap();
     let device = served.connect(&alice).unwrap();
     device.open_channel(Channel::Can1, Some(in_mode(&device, Mode::Normal))).unwrap();
     for _ in 0..5 {
         device.send(Channel::Can1, &[frame("123#11")]).unwrap();
     }
     is_refused(&device.send(Channel::Can1, &[frame("124#")]), "another identifier");
+    // Whose role does not allow something is recorded, too.
+    let listener = served.connect(&bob).unwrap();
+    let normal = in_mode(&listener, Mode::Normal);
+    assert!(listener.open_channel(Channel::Can1, Some(normal)).is_err());
+    drop(listener);
     device.stop().unwrap();
     drop(device);
+    served.tells("has left");
     served.tells("has left");
     let Served { board, listening, .. } = served;
     drop((listening, board, audit));
@@ -313,6 +321,13 @@ fn the_record_has_who_did_what() {
         assert_eq!(event["certificate"], "alice", "{event}");
         assert!(event["address"].as_str().unwrap().starts_with("127.0.0.1:"), "{event}");
     }
+    let refused = events.iter().filter(|event| event["event"] == "not_permitted");
+    let refused: Vec<_> =
+        refused.map(|event| (&event["certificate"], event["text"].as_str().unwrap())).collect();
+    assert!(
+        refused.iter().any(|(name, text)| *name == "bob" && text.contains("needs the right to send")),
+        "{refused:?}"
+    );
     assert_eq!(
         (&of("opened")["mode"], &of("opened")["bitrate_bps"]),
         (&"normal".into(), &BITRATE_BPS.into())

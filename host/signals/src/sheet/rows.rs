@@ -1,5 +1,6 @@
 //! The rows of a spreadsheet or of a text with separators, as texts.
 
+use std::cell::Cell;
 use std::collections::HashMap;
 
 use roxmltree::{Document, Node};
@@ -70,12 +71,12 @@ pub(super) fn of_workbook(bytes: &[u8]) -> Result<Vec<Sheet>, String> {
     let targets: HashMap<&str, &str> = elements(links.root(), "Relationship")
         .filter_map(|link| Some((link.attribute("Id")?, link.attribute("Target")?)))
         .collect();
-    let shared = match parts.text("xl/sharedStrings.xml") {
+    let shared: Vec<String> = match parts.text("xl/sharedStrings.xml") {
         Ok(text) => elements(document(&text)?.root(), "si").map(text_of).collect(),
         // A workbook without texts has no such part.
         Err(_) => Vec::new(),
     };
-    let mut sheets = Vec::new();
+    let (mut sheets, mut room) = (Vec::new(), Room(MOST_CELL_BYTES));
     for sheet in elements(workbook.root(), "sheet") {
         let id = sheet.attributes().find(|attribute| attribute.name() == "id").map(|id| id.value());
         let Some(target) = id.and_then(|id| targets.get(id)) else { continue };
@@ -84,30 +85,63 @@ pub(super) fn of_workbook(bytes: &[u8]) -> Result<Vec<Sheet>, String> {
             None => format!("xl/{target}"),
         };
         // A sheet may be a chart.
-        let Ok(text) = parts.text(&path) else { continue };
+        let text = match parts.text(&path) {
+            Ok(text) => text,
+            Err(_) if parts.left.get() > 0 => continue,
+            Err(why) => return Err(why),
+        };
         let name = sheet.attribute("name").unwrap_or_default().to_owned();
-        sheets.push(Sheet { name, rows: trimmed(rows(&document(&text)?, &shared)) });
+        sheets.push(Sheet { name, rows: trimmed(rows(&document(&text)?, &shared, &mut room)?) });
     }
     Ok(sheets)
+}
+
+/// How many bytes the cells of a workbook come to: a few letters can say that a row has 16 384 cells, and that a cell has a text that a thousand
+/// others have.
+const MOST_CELL_BYTES: usize = 128 << 20;
+/// How many bytes of a workbook are unpacked altogether: a part may be several sheets.
+const MOST_UNPACKED_BYTES: u64 = 256 << 20;
+
+/// What a text or a row takes besides its letters or cells, about.
+const ALLOCATION: usize = 64;
+
+/// How many bytes cells may still come to.
+struct Room(usize);
+
+impl Room {
+    fn take(&mut self, bytes: usize) -> Result<(), String> {
+        let left = self.0.checked_sub(bytes);
+        self.0 = left.ok_or("its cells come to more than 128 MiB; save the table of signals alone")?;
+        Ok(())
+    }
 }
 
 /// The parts of an archive, by their names.
 struct Parts<'a> {
     archive: &'a Archive<'a>,
     members: HashMap<String, super::super::zip::Member>,
+    left: Cell<u64>,
 }
 
 impl<'a> Parts<'a> {
     fn of(archive: &'a Archive<'a>) -> Result<Self, String> {
         let members = archive.members().map(|member| member.map(|member| (member.name.clone(), member)));
-        Ok(Self { archive, members: members.collect::<Result<_, _>>().map_err(|error| error.to_string())? })
+        let members = members.collect::<Result<_, _>>().map_err(|error| error.to_string())?;
+        Ok(Self { archive, members, left: Cell::new(MOST_UNPACKED_BYTES) })
     }
 
     fn text(&self, name: &str) -> Result<String, String> {
         /// No table of signals is longer.
         const MOST_BYTES: u64 = 64 << 20;
         let member = self.members.get(name).ok_or_else(|| format!("it has no part {name}"))?;
-        let bytes = self.archive.unpack(member, MOST_BYTES).map_err(|error| format!("{name} {error}"))?;
+        let most = MOST_BYTES.min(self.left.get());
+        let bytes = self.archive.unpack(member, most).map_err(|error| {
+            if most < MOST_BYTES {
+                self.left.set(0);
+            }
+            format!("{name} {error}")
+        })?;
+        self.left.set(self.left.get() - bytes.len() as u64);
         String::from_utf8(bytes).map_err(|_| format!("{name} is not in UTF-8"))
     }
 }
@@ -127,7 +161,7 @@ fn text_of(of: Node<'_, '_>) -> String {
     texts.filter_map(|node| node.text()).collect()
 }
 
-fn rows(sheet: &Document<'_>, shared: &[String]) -> Vec<(u32, Vec<String>)> {
+fn rows(sheet: &Document<'_>, shared: &[String], room: &mut Room) -> Result<Vec<(u32, Vec<String>)>, String> {
     /// Columns from A to XFD.
     const MOST_COLUMNS: usize = 16_384;
     let mut found: Vec<(u32, Vec<String>)> = Vec::new();
@@ -161,12 +195,15 @@ fn rows(sheet: &Document<'_>, shared: &[String]) -> Vec<(u32, Vec<String>)> {
                         .map_or_else(String::new, |text| format!("={text}"))
                 }
             };
-            cells.resize(cells.len().max(at + 1), String::new());
+            let more = (at + 1).saturating_sub(cells.len());
+            room.take(more * size_of::<String>() + text.len() + ALLOCATION)?;
+            cells.resize(cells.len() + more, String::new());
             cells[at] = text;
         }
+        room.take(size_of::<(u32, Vec<String>)>() + ALLOCATION)?;
         found.push((number, cells));
     }
-    found
+    Ok(found)
 }
 
 /// The column of a cell such as `AB12`, from 0.

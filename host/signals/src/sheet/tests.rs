@@ -146,6 +146,50 @@ fn workbooks_are_read() {
     assert_eq!(crate::parse("table.xlsx", bytes).unwrap().messages.len(), 2);
 }
 
+/// Workbooks of some kilobytes that come to more than any computer has.
+#[test]
+fn workbooks_that_come_to_too_much_are_refused() {
+    let workbook = |sheets: usize, sheet: &str, shared: &str| {
+        let sheets = "<sheet name=\"s\" r:id=\"r1\"/>".repeat(sheets);
+        let links =
+            "<Relationships><Relationship Id=\"r1\" Target=\"worksheets/sheet1.xml\"/></Relationships>";
+        let files = [
+            ("xl/workbook.xml", format!("<workbook xmlns:r=\"r\"><sheets>{sheets}</sheets></workbook>")),
+            ("xl/_rels/workbook.xml.rels", links.to_owned()),
+            ("xl/worksheets/sheet1.xml", format!("<worksheet><sheetData>{sheet}</sheetData></worksheet>")),
+            ("xl/sharedStrings.xml", format!("<sst><si><t>{shared}</t></si></sst>")),
+        ];
+        let mut bytes = Vec::new();
+        let mut archive = rawzip::ZipArchiveWriter::new(&mut bytes);
+        for (name, content) in files {
+            let (mut entry, config) = archive
+                .new_file(name)
+                .compression_method(rawzip::CompressionMethod::DEFLATE)
+                .start()
+                .unwrap();
+            let encoder = flate2::write::DeflateEncoder::new(&mut entry, flate2::Compression::fast());
+            let mut writer = config.wrap(encoder);
+            std::io::Write::write_all(&mut writer, content.as_bytes()).unwrap();
+            let (encoder, descriptor) = writer.finish().unwrap();
+            encoder.finish().unwrap();
+            entry.finish(descriptor).unwrap();
+        }
+        archive.finish().unwrap();
+        bytes
+    };
+    let wide = "<row><c r=\"XFD1\"><v>1</v></c></row>".repeat(100_000);
+    let texts = "<row><c t=\"s\"><v>0</v></c></row>".repeat(100_000);
+    let empty = format!("<row/>{}", " ".repeat(32 << 20));
+    for (bytes, words) in [
+        (workbook(1, &wide, ""), "cells come to more than"),
+        (workbook(1, &texts, &"x".repeat(100_000)), "cells come to more than"),
+        (workbook(1000, &empty, ""), "sheet1.xml is too long"),
+    ] {
+        let error = parse("table.xlsx", &bytes).unwrap_err().to_string();
+        assert!(error.contains(words), "{error}");
+    }
+}
+
 proptest::proptest! {
     #[test]
     fn any_text_is_read_or_refused(text in "(ID,Message,Signal,Start bit,Length,Byte order\n)?([0-9x;,\"A-Fm\n.-]{0,120})") {

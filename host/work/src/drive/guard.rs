@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
-use cantap_protocols::Party;
 use cantap_protocols::active::Machine;
 use cantap_protocols::active::heartbeat::{HeartbeatProducer, WithHeartbeat};
 use cantap_protocols::active::sdo::{SdoClient, SdoIds, SdoJob};
@@ -48,9 +47,7 @@ impl Drive<'_, '_> {
         let producer = HeartbeatProducer::new(own, nanoseconds(guard.within / BEATS));
         let producer = producer.context("nodes have numbers from 1 to 127")?;
         self.speaking.listen(guard.within.clamp(LISTENS[0], LISTENS[1]))?;
-        let events = self.speaking.take_events();
-        let is_there = events.iter().any(|event| event.from == Party::Node(own));
-        self.speaking.put_back(events);
+        let is_there = self.heard.get() >> own & 1 == 1;
         anyhow::ensure!(
             own != node && !is_there,
             "node {own} is there; give --guard-node a number that no node has"

@@ -13,6 +13,8 @@ mod print_frames;
 #[path = "../../examples/statistics_of_a_file.rs"]
 mod statistics_of_a_file;
 
+mod speaking;
+
 const LOG: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/engine.log");
 const DATABASE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/data/engine.dbc");
 

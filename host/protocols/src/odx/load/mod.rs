@@ -5,6 +5,7 @@ mod dops;
 mod layers;
 mod params;
 
+use cantap_signals::text_places::{Lines, check_entities};
 use roxmltree::{Document, Node, ParsingOptions};
 use rustc_hash::FxHashMap;
 
@@ -45,7 +46,7 @@ pub struct Loader {
     by_name: FxHashMap<Name, Link>,
     files: Vec<String>,
     /// Where each line of the document begins.
-    lines: Vec<u32>,
+    lines: Lines,
     container: u32,
     layer: u32,
 }
@@ -53,16 +54,16 @@ pub struct Loader {
 impl Loader {
     /// Reads a document.
     pub fn document(&mut self, name: &str, text: &str) -> Result<(), OdxError> {
-        // A document type may define entities; what they expand to is limited by roxmltree.
+        let no_xml = |reason: String| OdxError::Xml { document: name.to_owned(), reason };
+        check_entities(text).map_err(|error| no_xml(error.to_string()))?;
         let options =
             ParsingOptions { allow_dtd: true, nodes_limit: MOST_NODES, ..ParsingOptions::default() };
         let document = Document::parse_with_options(text, options).map_err(|error| match error {
             roxmltree::Error::NodesLimitReached => OdxError::TooLarge,
-            error => OdxError::Xml { document: name.to_owned(), reason: error.to_string() },
+            error => no_xml(error.to_string()),
         })?;
         self.files.push(cantap_trace::clean::line(name).into_owned());
-        self.lines.clear();
-        self.lines.extend((0..).zip(text.bytes()).filter(|(_, byte)| *byte == b'\n').map(|(at, _)| at));
+        self.lines = Lines::of(text);
         let root = document.root_element();
         if root.tag_name().name() == "CANDELA" {
             self.candela(root);
@@ -191,7 +192,7 @@ impl Loader {
     }
 
     fn line(&self, node: Node<'_, '_>) -> u32 {
-        self.lines.partition_point(|end| (*end as usize) < node.range().start) as u32 + 1
+        self.lines.line(node.range().start)
     }
 
     /// Something at this place is not understood.

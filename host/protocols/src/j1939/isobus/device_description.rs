@@ -124,13 +124,11 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
     let mut pool = Pool(data);
     for _ in 0..MOST_RECORDS {
         let before = pool.0;
-        match pool.record() {
-            Some((kind, text)) => fields.push(Field::text(kind, text)),
-            None => {
-                pool.0 = before;
-                break;
-            }
-        }
+        let Some((kind, text)) = pool.record() else {
+            pool.0 = before;
+            break;
+        };
+        fields.push(Field::text(kind, text));
     }
     if !pool.0.is_empty() {
         fields.push(Field::number("not_read", pool.0.len() as i64).unit("bytes"));

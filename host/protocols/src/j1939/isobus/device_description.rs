@@ -1,6 +1,7 @@
 //! The records of a device descriptor object pool (ISO 11783-10, annex A): what a task controller's client has and can do.
 
-use super::{FILE, process_data};
+use super::identifiers;
+use super::tables::FILE;
 use crate::Field;
 use crate::table::Table;
 
@@ -108,8 +109,8 @@ impl<'a> Pool<'a> {
 }
 
 fn of(ddi: u16) -> String {
-    match process_data::identifier_name(ddi) {
-        Some(name) => format!("DDI {ddi} ({name})"),
+    match identifiers::get(ddi) {
+        Some(known) => format!("DDI {ddi} ({})", known.name),
         None => format!("DDI {ddi}"),
     }
 }

@@ -248,6 +248,9 @@ pub fn once(
             _ => std::thread::sleep(Duration::from_millis(10)),
         }
     }
+    if is_file {
+        lock(&model).conclude();
+    }
     app.catch_up(&mut lock(&model));
     let (screen, nothing_read) = {
         let model = lock(&model);

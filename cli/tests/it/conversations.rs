@@ -35,15 +35,14 @@ const WORKSHOP: &str = "\
 /// A sprayer at a terminal and a task controller: it was bytes, with PGNs for names.
 #[test]
 fn what_agricultural_machines_say_has_names_and_values() {
-    let log: String = (1..=9)
-        .map(|second| {
-            format!(
-                "({second}.000000) can0 0CF00400#017DA06813FFF0FF\n({second}.100000) can0 0CFE4800#B80B40420F00FFD5\n\
-                 ({second}.200000) can0 14E72680#A8D204FF3930000{second}\n({second}.210000) can0 14E68026#A8D204003930000{second}\n\
-                 ({second}.300000) can0 0CCBF780#33004800B004000{second}\n"
-            )
-        })
-        .collect();
+    let lines = (1..=9).map(|second| {
+        format!(
+            "({second}.000000) can0 0CF00400#017DA06813FFF0FF\n({second}.100000) can0 0CFE4800#B80B40420F00FFD5\n\
+             ({second}.200000) can0 14E72680#A8D204FF3930000{second}\n({second}.210000) can0 14E68026#A8D204003930000{second}\n\
+             ({second}.300000) can0 0CCBF780#33004800B004000{second}\n"
+        )
+    });
+    let log = lines.collect::<Vec<_>>().concat();
     let (code, out, err) = cantap("tractor", &log, &[]);
     assert!(code == Some(0) && err.contains("channel 1 speaks j1939\n"), "{err}");
     for line in [

@@ -333,12 +333,11 @@ impl Reader {
         let (mut groups, mut names) = (Vec::<Vec<Block>>::new(), HashMap::<String, usize>::new());
         for block in self.blocks {
             // A block without identifiers goes on with the last one of its name.
-            match names.get(&block.name).filter(|_| block.ids.is_none()) {
-                Some(at) => groups[*at].push(block),
-                None => {
-                    names.insert(block.name.clone(), groups.len());
-                    groups.push(vec![block]);
-                }
+            if let Some(at) = names.get(&block.name).filter(|_| block.ids.is_none()) {
+                groups[*at].push(block);
+            } else {
+                names.insert(block.name.clone(), groups.len());
+                groups.push(vec![block]);
             }
         }
         let mut unflagged = Unflagged::default();

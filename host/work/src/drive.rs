@@ -1,6 +1,7 @@
 //! A drive (CiA 402) in motion: what it is told, and the state in which it is left, whatever happens.
 
 mod guard;
+mod watched;
 
 use std::cell::Cell;
 use std::fmt;
@@ -16,7 +17,7 @@ use cantap_protocols::canopen::drive::{DriveState, error, mode_name, status_flag
 use cantap_protocols::{EventKind, Party};
 
 pub use self::guard::Guard;
-use self::guard::{Guarded, run};
+use self::watched::{Guarded, run};
 use crate::advice::sentence;
 use crate::interrupt;
 use crate::speaking::Speaking;

@@ -238,6 +238,11 @@ impl Model {
         *taken += records.len() as u64;
     }
 
+    /// There are no more records: what they say together is complete.
+    pub fn conclude(&mut self) {
+        self.talk.conclude(&mut self.seen.talked);
+    }
+
     /// The time is now `now_ns` although nothing happened.
     pub fn advance(&mut self, now_ns: i64) {
         let Seen { statistics, loads, now_ns: latest_ns, .. } = &mut self.seen;

@@ -44,7 +44,16 @@ impl Talk {
 
     /// Takes records. The first seconds of a bus are examined before they are decoded.
     pub fn take(&mut self, records: &[TraceRecord], talked: &mut Talked) {
-        let Ok(()) = self.reading.take(records, true, |event| {
+        self.read(records, true, talked);
+    }
+
+    /// There are no more records: what waits in the first seconds is read now, and what was under way ends.
+    pub fn conclude(&mut self, talked: &mut Talked) {
+        self.read(&[], false, talked);
+    }
+
+    fn read(&mut self, records: &[TraceRecord], more: bool, talked: &mut Talked) {
+        let Ok(()) = self.reading.take(records, more, |event| {
             talked.events += 1;
             talked.faults += u64::from(event.is_fault());
             talked.overview.take(&event);

@@ -93,8 +93,8 @@ impl Eds {
         let latin = || bytes.iter().map(|byte| char::from(*byte)).collect();
         let text = str::from_utf8(bytes).map_or_else(|_| latin(), str::to_owned);
         let text = text.trim_start_matches('\u{FEFF}');
-        if super::xdd::is_xml(text) {
-            return super::xdd::parse(text);
+        if text.trim_start().starts_with('<') {
+            return Self::of_xml(text);
         }
         let sections = eds.sections(text);
         if let Some(info) = sections.get("deviceinfo") {

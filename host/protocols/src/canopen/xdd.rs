@@ -32,13 +32,14 @@ const TYPES: [(&str, u16); 18] = [
     ("WSTRING", 0x0B),
 ];
 
-/// Whether a file's text is XML.
-pub fn is_xml(text: &str) -> bool {
-    text.trim_start().starts_with('<')
+impl Eds {
+    /// Reads a sheet in XML.
+    pub(super) fn of_xml(text: &str) -> Self {
+        read(text)
+    }
 }
 
-/// Reads a file's text.
-pub fn parse(text: &str) -> Eds {
+fn read(text: &str) -> Eds {
     let mut eds = Eds::default();
     let document = match Document::parse(text) {
         Ok(document) => document,

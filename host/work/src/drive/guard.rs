@@ -3,12 +3,11 @@
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow, bail};
-use cantap_protocols::active::Machine;
-use cantap_protocols::active::heartbeat::{HeartbeatProducer, WithHeartbeat};
+use cantap_protocols::active::heartbeat::HeartbeatProducer;
 use cantap_protocols::active::sdo::{SdoClient, SdoIds, SdoJob};
 
+use super::watched::{Guarded, run};
 use super::{Drive, nanoseconds};
-use crate::speaking::Speaking;
 
 /// Our heartbeat, which the drive watches during a motion: if this computer or the cable to it is gone, the drive ends the motion by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,13 +26,6 @@ const LISTENS: [Duration; 2] = [Duration::from_millis(500), Duration::from_secs(
 const CONSUMER_HEARTBEAT: u16 = 0x1016;
 /// What the drive does when its connection is lost (CiA 402).
 const ABORT_CONNECTION: u16 = 0x6007;
-
-/// An entry of the drive's, and what it was before.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Guarded {
-    sub: u8,
-    before: u32,
-}
 
 impl Drive<'_, '_> {
     /// Has the drive watch our heartbeat from now to the end of the motion. Returns what that changes, in words.
@@ -117,22 +109,4 @@ impl Drive<'_, '_> {
         run(self.speaking, self.heartbeat.as_mut(), &mut client, is_last)?;
         client.finish().map_err(|error| anyhow!("node {}: object {index:04X}:{sub:02X}: {error}", self.node))
     }
-}
-
-/// Runs a client, with our heartbeat beside it if it is watched.
-pub(super) fn run(
-    speaking: &mut Speaking<'_>,
-    heartbeat: Option<&mut HeartbeatProducer>,
-    client: &mut dyn Machine,
-    is_last: bool,
-) -> anyhow::Result<()> {
-    let mut both;
-    let machine: &mut dyn Machine = match heartbeat {
-        Some(heartbeat) => {
-            both = WithHeartbeat::new(client, heartbeat);
-            &mut both
-        }
-        None => client,
-    };
-    if is_last { speaking.run_last(machine) } else { speaking.run(machine) }
 }

@@ -1,6 +1,7 @@
 //! The records of a device descriptor object pool (ISO 11783-10, annex A): what a task controller's client has and can do.
 
-use super::{FILE, process_data};
+use super::identifiers;
+use super::tables::FILE;
 use crate::Field;
 use crate::table::Table;
 
@@ -108,8 +109,8 @@ impl<'a> Pool<'a> {
 }
 
 fn of(ddi: u16) -> String {
-    match process_data::identifier_name(ddi) {
-        Some(name) => format!("DDI {ddi} ({name})"),
+    match identifiers::get(ddi) {
+        Some(known) => format!("DDI {ddi} ({})", known.name),
         None => format!("DDI {ddi}"),
     }
 }
@@ -124,13 +125,11 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
     let mut pool = Pool(data);
     for _ in 0..MOST_RECORDS {
         let before = pool.0;
-        match pool.record() {
-            Some((kind, text)) => fields.push(Field::text(kind, text)),
-            None => {
-                pool.0 = before;
-                break;
-            }
-        }
+        let Some((kind, text)) = pool.record() else {
+            pool.0 = before;
+            break;
+        };
+        fields.push(Field::text(kind, text));
     }
     if !pool.0.is_empty() {
         fields.push(Field::number("not_read", pool.0.len() as i64).unit("bytes"));

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::LazyLock;
 
-use super::FILE;
+use super::tables::FILE;
 use crate::Field;
 use crate::table::{Table, lines};
 

@@ -2,14 +2,15 @@
 //! (TIM), and what control functions can do. The tables, with their sources, are `data/isobus.csv` and `data/isobus-ddi.csv`.
 
 mod device_description;
+mod identifiers;
 mod layout;
 mod process_data;
+mod tables;
 
+use self::tables::FILE;
 use super::header::Header;
 use crate::table::Table;
 use crate::{Event, Field};
-
-const FILE: &str = include_str!("../../../data/isobus.csv");
 
 const VT_TO_ECU: u32 = 0xE600;
 const ECU_TO_VT: u32 = 0xE700;
@@ -171,6 +172,6 @@ mod tests {
             (TIM_CODES.get(5_u8), FUNCTIONALITY.get(16_u8)),
             (Some("auxiliary valve"), Some("TIM client"))
         );
-        assert!(process_data::count() > 700);
+        assert!(identifiers::count() > 700);
     }
 }

@@ -1,54 +1,16 @@
 //! What task controllers and their clients send each other (ISO 11783-10).
 
 use std::borrow::Cow;
-use std::sync::LazyLock;
 
-use rustc_hash::FxHashMap;
-
-use super::{FILE, device_description, layout};
-use crate::table::{Scale, Table, lines};
-use crate::{Event, Field, naming};
-
-const DDI_FILE: &str = include_str!("../../../data/isobus-ddi.csv");
+use super::identifiers::Identifier;
+use super::tables::FILE;
+use super::{device_description, identifiers, layout};
+use crate::table::Table;
+use crate::{Event, Field};
 
 static COMMANDS: Table = Table::new(FILE, "process_data");
-static IDENTIFIERS: LazyLock<FxHashMap<u16, Identifier>> = LazyLock::new(|| {
-    // What cannot be read is left out, of which the table has nothing: a test counts the lines.
-    lines(DDI_FILE).filter_map(Identifier::read).collect()
-});
 
 const OBJECT_POOL_TRANSFER: u8 = 0x61;
-
-/// How many data dictionary identifiers have a name.
-#[cfg(test)]
-pub fn count() -> usize {
-    assert_eq!(IDENTIFIERS.len(), lines(DDI_FILE).count());
-    IDENTIFIERS.len()
-}
-
-/// A data dictionary identifier (DDI).
-#[derive(Debug)]
-struct Identifier {
-    scale: Scale,
-    unit: &'static str,
-    name: &'static str,
-    /// In the form of other fields.
-    field: String,
-}
-
-impl Identifier {
-    fn read(line: &'static str) -> Option<(u16, Self)> {
-        let mut columns = line.splitn(4, ',');
-        let ddi = u16::from_str_radix(columns.next()?, 16).ok()?;
-        let (scale, unit, name) = (Scale::read(columns.next()?)?, columns.next()?, columns.next()?);
-        Some((ddi, Self { scale, unit, name, field: naming::plain(name) }))
-    }
-}
-
-/// The name of a data dictionary identifier.
-pub fn identifier_name(ddi: u16) -> Option<&'static str> {
-    IDENTIFIERS.get(&ddi).map(|identifier| identifier.name)
-}
 
 /// Adds what a message says; false if its command is reserved or it is too short.
 pub fn fields(data: &[u8], event: &mut Event) -> bool {
@@ -82,7 +44,7 @@ pub fn fields(data: &[u8], event: &mut Event) -> bool {
         return true;
     }
     let ddi = u16::from_le_bytes([low_ddi, high_ddi]);
-    let identifier = IDENTIFIERS.get(&ddi);
+    let identifier = identifiers::get(ddi);
     fields.push(Field::number("element", u16::from(first >> 4) | u16::from(high) << 4));
     fields.push(Field::number("ddi", ddi).meaning(identifier.map(|identifier| identifier.name)));
     let number = i32::from_le_bytes(value);

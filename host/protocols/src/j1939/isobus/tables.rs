@@ -1,0 +1,4 @@
+//! The file of the tables.
+
+/// `data/isobus.csv`.
+pub const FILE: &str = include_str!("../../../data/isobus.csv");

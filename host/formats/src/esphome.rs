@@ -154,7 +154,7 @@ mod tests {
     #[test]
     fn frames_without_bytes_are_no_frames_of_zeros() {
         let line = "[12:00:01][D][canbus:070]: received can message (#1) std can_id=0x305 size=8\n";
-        let (records, issues) = tests::read(Format::EspHome, &line.repeat(3));
+        let (records, issues) = tests::read(Format::EspHome, line.repeat(3));
         assert_eq!(records.len(), 0);
         assert!(issues.len() == 1 && issues[0].contains("level: VERBOSE"), "{issues:?}");
         let gap = format!("{line}[12:00:01][V][canbus:077]:   can_message.data[1]=0a\n");

@@ -195,7 +195,7 @@ mod tests {
     fn frames_that_are_wrong_or_not_whole_are_none() {
         let wrong = STANDARD.replace("can-1: CRC delimiter: 1\n", "can-1: CRC is invalid\n");
         let short = STANDARD.replace("can-1: Data byte 1: 0x0a\n", "");
-        let (records, issues) = tests::read(Format::Sigrok, &format!("{wrong}{short}{}", &STANDARD[..120]));
+        let (records, issues) = tests::read(Format::Sigrok, format!("{wrong}{short}{}", &STANDARD[..120]));
         assert_eq!(records.len(), 0);
         assert_eq!(issues.len(), 2, "{issues:?}");
         assert!(

@@ -119,10 +119,14 @@ mod tests {
 
     fn values(patterns: &[&str], frames: &[(f64, &str)]) -> (Vec<String>, Vec<String>) {
         let mut selection = FieldSelection::default();
-        patterns.iter().for_each(|pattern| assert!(selection.add(pattern).unwrap()));
+        for pattern in patterns {
+            assert!(selection.add(pattern).unwrap());
+        }
         let mut reader = Reader::new(Options { protocols: selection.protocols(), ..Options::default() });
         let mut events = Vec::new();
-        frames.iter().for_each(|(ms, frame)| reader.push(&at(*ms, frame), &mut events));
+        for (ms, frame) in frames {
+            reader.push(&at(*ms, frame), &mut events);
+        }
         reader.finish(&mut events);
         let mut said = Vec::new();
         for event in &events {

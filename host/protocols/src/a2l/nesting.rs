@@ -249,8 +249,8 @@ mod tests {
 
     #[test]
     fn a_grammar_that_comes_to_too_much_is_left_out() {
-        let doubled: String =
-            (1..40).map(|at| format!("struct a{at} {{ struct a{0}; struct a{0}; }};", at - 1)).collect();
+        let twice = |at| format!("struct a{at} {{ struct a{0}; struct a{0}; }};", at - 1);
+        let doubled = (1..40).map(twice).collect::<Vec<_>>().concat();
         assert!(is_cut(&format!("struct a0 {{ uchar; }}; {doubled}")), "each is twice the one before");
         assert!(is_cut("struct { taggedstruct { }[1000][1000][1000]; };"));
         assert!(is_cut("struct { uchar[4000000000]; };"));

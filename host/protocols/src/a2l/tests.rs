@@ -157,8 +157,8 @@ fn blocks_in_blocks_and_types_in_types_do_not_use_up_the_stack() {
         &format!("{}/begin IF_DATA Maker", "/begin IF_DATA X ".repeat(200_000)),
     );
     assert_eq!(Description::parse(&deep).unwrap_err(), A2lError::TooDeep);
-    let doubled: String =
-        (1..40).map(|at| format!("struct a{at} {{ struct a{0}; struct a{0}; }};", at - 1)).collect();
+    let twice = |at| format!("struct a{at} {{ struct a{0}; struct a{0}; }};", at - 1);
+    let doubled = (1..40).map(twice).collect::<Vec<_>>().concat();
     for grammar in [format!("struct a0 {{ uchar; }}; {doubled}"), "struct { ".repeat(200_000)] {
         let text =
             ECU.replace("/begin MOD_COMMON", &format!("/begin A2ML {grammar} /end A2ML /begin MOD_COMMON"));

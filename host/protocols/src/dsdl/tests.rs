@@ -156,7 +156,7 @@ fn anything_is_taken() {
 fn definitions_of_strangers_are_read_in_a_time_that_grows_with_them() {
     // Each constant names the next one ten times.
     let next = |at: u32| vec![format!("A{}", at + 1); 10].join(" + ");
-    let constants: String = (0..14).map(|at| format!("uint16 A{at} = {}\n", next(at))).collect();
+    let constants = (0..14).map(|at| format!("uint16 A{at} = {}\n", next(at))).collect::<Vec<_>>().concat();
     let (library, problems) =
         of(Generation::DroneCan, &[("a/100.B.uavcan", &format!("{constants}uint16 A14 = 1\nuint8[A9] x\n"))]);
     assert_eq!(problems, [""; 0]);
@@ -172,12 +172,14 @@ fn definitions_of_strangers_are_read_in_a_time_that_grows_with_them() {
     ];
     assert_eq!(of(Generation::DroneCan, &arrays).1, [""; 0]);
     // Many constants beside many fields.
-    let many: String = (0..30_000).map(|at| format!("uint16 F{at}_A = {at}\nuint16 f{at}\n")).collect();
+    let pair = |at| format!("uint16 F{at}_A = {at}\nuint16 f{at}\n");
+    let many = (0..30_000).map(pair).collect::<Vec<_>>().concat();
     let (library, _) = of(Generation::DroneCan, &[("a/100.B.uavcan", &many)]);
     assert_eq!(library.named("a.B").unwrap().request.members[29_999].meanings, [(29_999, "a".to_owned())]);
     // Types in types, of which the innermost has no length.
     let inner = |at: u32| {
-        (0..30).map(|field| format!("T{}.1.0 f{field}\n", at + 1)).collect::<String>() + "@sealed\n"
+        let member = |field| format!("T{}.1.0 f{field}\n", at + 1);
+        (0..30).map(member).collect::<Vec<_>>().concat() + "@sealed\n"
     };
     let mut sources: Vec<_> = (0..12).map(|at| (format!("a/T{at}.1.0.dsdl"), inner(at))).collect();
     sources.push(("a/T12.1.0.dsdl".to_owned(), "@sealed\n".to_owned()));

@@ -126,13 +126,16 @@ impl Model {
                 _ => continue,
             };
             let DopKind::Dtcs(dtcs) = &self.dops[dop as usize].kind else { continue };
-            match only {
-                Some(code) => dtcs.codes.get(&code).into_iter().for_each(|dtc| take(code, dtc)),
-                None => {
-                    dtcs.codes.iter().for_each(|(code, dtc)| take(*code, dtc));
-                    left.extend(dtcs.others.iter().rev().filter_map(|other| self.item(*other)));
+            if let Some(code) = only {
+                if let Some(dtc) = dtcs.codes.get(&code) {
+                    take(code, dtc);
                 }
+                continue;
             }
+            for (code, dtc) in &dtcs.codes {
+                take(*code, dtc);
+            }
+            left.extend(dtcs.others.iter().rev().filter_map(|other| self.item(*other)));
         }
     }
 }

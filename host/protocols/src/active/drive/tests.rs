@@ -83,7 +83,7 @@ impl Drive {
         self.polls += 1;
         let state = match (self.lie, self.state) {
             (Lie::Frozen, _) => State::SwitchOnDisabled,
-            (Lie::Flaps, _) if self.polls % 2 == 0 => State::NotReadyToSwitchOn,
+            (Lie::Flaps, _) if self.polls.is_multiple_of(2) => State::NotReadyToSwitchOn,
             (Lie::Flaps, _) => State::ReadyToSwitchOn,
             (Lie::NoState, State::ReadyToSwitchOn) => return 0x0001,
             (_, state) => state,

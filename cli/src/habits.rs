@@ -124,6 +124,13 @@ pub fn advice(
             known.map(|(_, advice)| (*advice).to_owned()).or_else(|| of_file(Path::new(text)))
         }
         ErrorKind::UnknownArgument => of_argument(text(ContextKind::InvalidArg)?, command?, arguments),
+        // As candump chooses how times are shown.
+        ErrorKind::ValueValidation => {
+            let is_time = text(ContextKind::InvalidArg)?.starts_with("--time");
+            let is_candumps = matches!(text(ContextKind::InvalidValue)?, "a" | "A" | "d" | "z");
+            (is_time && is_candumps)
+                .then(|| "-t says for how long, as in: -t 10s; a trace has the time of each frame".to_owned())
+        }
         _ => None,
     }
 }

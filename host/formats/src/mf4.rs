@@ -42,6 +42,9 @@ use cantap_can::BusErrorKind;
 pub(crate) const FILE_MAGIC: &[u8] = b"MDF     ";
 pub(crate) const UNFINISHED_MAGIC: &[u8] = b"UnFinMF ";
 
+/// The program that wrote the file, in its head: this library.
+const PROGRAM_NAME: [u8; 8] = *b"cantap  ";
+
 /// The channel for events that the standard does not have, in the words of [`super::event_text`].
 const WORDS: &str = "cantap_Event";
 

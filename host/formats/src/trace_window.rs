@@ -20,7 +20,7 @@ pub(crate) struct Decoder {
     is_decimal: bool,
     /// To be reported before anything is read.
     untold: bool,
-    /// Whether there was a row on a CAN bus.
+    /// Whether there was the row of a frame.
     has_rows: bool,
 }
 
@@ -174,8 +174,9 @@ impl RowFormat for Decoder {
         let words = words(line);
         match columns(&words, zone) {
             Some(columns) => {
-                self.has_rows = true;
-                self.row(&columns, line)
+                let row = self.row(&columns, line);
+                self.has_rows |= !matches!(row, Ok(Line::LeftOut(OTHER_ROWS)));
+                row
             }
             None if words.first().is_some_and(|word| time_of(word, zone).is_some()) => {
                 Ok(Line::LeftOut(OTHER_ROWS))

@@ -106,6 +106,10 @@ impl Source<'_> {
             return false;
         }
         plan.addresses.iter().enumerate().any(|(board, address)| {
+            // What a pipe has for who opens it first is for the session.
+            if address.has_bit_rate() {
+                return false;
+            }
             let Ok(device) = address.open() else { return false };
             if device.hello().capabilities & capability::NO_BIT_RATE != 0 {
                 return false;

@@ -75,6 +75,7 @@ pub fn settle(
         match wanted {
             BitRate::Off => continue,
             BitRate::Given(bitrate_bps) => rates.push(rate(bitrate_bps)),
+            BitRate::Auto if address.has_bit_rate() => {}
             BitRate::Auto if address.bitrates_of_buses()[channel.index()].is_some() => {}
             BitRate::Auto => {
                 let device = match &device {

@@ -19,7 +19,7 @@ use super::map::{Map, Places};
 use super::order::Item;
 use super::part::{OPEN_LENGTH, Part, own};
 use super::place::{EVERY, Saved};
-use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
+use super::{FILE_MAGIC, HEADER_AT, PROGRAM_NAME, UNFINISHED_MAGIC};
 use cantap_trace::{PlainFrame, TraceRecord};
 
 const MEASURED: &str = "groups of measured signals";
@@ -263,6 +263,7 @@ impl Collecting<'_> {
     fn collect(&mut self, file: &mut Whole, zone: &Zone, parts: &mut Vec<Part>) -> Result<(), Fault> {
         const LOCAL_TIME: u8 = 1;
         const UNFINISHED_AT: usize = 60;
+        const PROGRAM: std::ops::Range<usize> = 16..24;
         let identification = file.read_at(0, HEADER_AT as usize)?;
         let is_unfinished = identification.starts_with(UNFINISHED_MAGIC);
         if !is_unfinished && !identification.starts_with(FILE_MAGIC) {
@@ -293,6 +294,7 @@ impl Collecting<'_> {
         let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
         let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
         self.map.open_end = open & OPEN_LENGTH != 0;
+        self.map.is_ordered = identification.get(PROGRAM) == Some(&PROGRAM_NAME[..]);
         self.map.alone = alone(file, header.link(0));
         let (mut next, mut count) = (header.link(0), 0);
         if next == 0 {

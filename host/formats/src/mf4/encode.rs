@@ -11,7 +11,9 @@ use super::super::output::Patch;
 use super::super::writer::WriteOptions;
 use super::comment::BIT_RATES;
 use super::part::{OPEN_COUNTERS, OPEN_LENGTH};
-use super::{BIT_ERROR, DEVICE_TIME, ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC, WORDS};
+use super::{
+    BIT_ERROR, DEVICE_TIME, ERROR_TYPES, FILE_MAGIC, HEADER_AT, PROGRAM_NAME, UNFINISHED_MAGIC, WORDS,
+};
 use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
 
@@ -273,7 +275,8 @@ impl Encoder {
         header.push(*b"##HD", &[group, history, 0, 0, 0, about], &date);
         self.head = blocks.0;
         self.head[HEADER_AT as usize..][..HEADER_BYTES].copy_from_slice(&header.0);
-        self.head[8..24].copy_from_slice(b"4.10    cantap  ");
+        self.head[8..16].copy_from_slice(b"4.10    ");
+        self.head[16..24].copy_from_slice(&PROGRAM_NAME);
         self.head[28..30].copy_from_slice(&410_u16.to_le_bytes());
         self.head[..8].copy_from_slice(UNFINISHED_MAGIC);
         let open = OPEN_COUNTERS | OPEN_LENGTH;
@@ -383,8 +386,8 @@ impl Encode for Encoder {
 mod tests {
     use super::super::super::tests;
     use crate::{Format, WriteOptions};
-    use cantap_trace::TraceRecord;
     use cantap_trace::testing::{data_record, record_or_fd, with_device_time};
+    use cantap_trace::{Direction, TraceEvent, TraceRecord};
     use proptest::prelude::*;
 
     proptest! {
@@ -412,6 +415,16 @@ mod tests {
             let counted = left_out.iter().filter(|(what, _)| *what == super::NO_DEVICE_TIME);
             prop_assert_eq!(counted.map(|(_, count)| count).sum::<u64>(), missing as u64);
         }
+    }
+
+    /// What other programs write is put in the order of time; ours has it as it was recorded.
+    #[test]
+    fn frames_of_two_kinds_that_go_back_a_little_stay_where_they_were() {
+        let mut records: Vec<_> = (0..4).map(data_record).collect();
+        let remote = "124#R".parse().unwrap();
+        records[2].event = TraceEvent::Frame { frame: remote, direction: Direction::Rx, late: false };
+        records[2].time_ns = records[0].time_ns - 1_000_000;
+        assert_eq!(tests::round_trip(Format::Mf4, &records), records);
     }
 
     #[test]

@@ -33,6 +33,8 @@ pub(super) struct Map {
     pub alone: HashMap<u64, u64>,
     /// Whether the last block's length was not written, so that it extends to the end of the file.
     pub open_end: bool,
+    /// Whether groups that share a stream are in the order in which things happened, as this library writes them: nothing is to be put in order.
+    pub is_ordered: bool,
     /// From an earlier reading of the file, if there was one.
     pub places: Option<Places>,
 }

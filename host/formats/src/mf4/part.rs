@@ -134,7 +134,7 @@ impl Part {
         });
         let plain = plain.collect();
         let buses = groups.iter().filter(|group| matches!(group.content, Content::Bus(_))).count();
-        let order = (buses > 1).then(|| Order::of(groups.len()));
+        let order = (buses > 1 && !map.is_ordered).then(|| Order::of(groups.len()));
         let is_counted = open & OPEN_COUNTERS == 0;
         let records = if is_sorted && is_counted { groups[0].records } else { u64::MAX };
         let part = Self {

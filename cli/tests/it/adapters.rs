@@ -109,7 +109,8 @@ fn no_bit_rate_is_asked_for_where_only_the_load_needs_it() {
     let (out, _) = on_pipe("no-rate-stats", "stats -d PIPE -t 700ms");
     assert!(out.contains("bit rate unknown: give it with -b"), "{out}");
     let (out, _) = on_pipe("no-rate-monitor", "monitor PIPE --once -t 700ms --view statistics");
-    assert!(out.contains("100") && !out.contains("0.0 %"), "{out}");
+    // The pipe is opened once: who opens it first has what was written so far.
+    assert!(out.contains("Channel 1: bit rate unknown (-b)\nFrames           100 "), "{out}");
     // Through a server, too.
     let (device, _done) = pipe("no-rate-doctor", "(1700000000.5) can0 123#11\n".repeat(50));
     let (_, out, _) = run(&["doctor", "-d", &device, "--json"]);

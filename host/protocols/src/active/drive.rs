@@ -90,7 +90,7 @@ impl DriveClient {
 
     /// An object of the first axis as this one has it. Those of the node are the same for all.
     pub const fn object(&self, index: u16) -> u16 {
-        if index >= FIRST_OF_PROFILE { index + self.axis_offset } else { index }
+        if index >= FIRST_OF_PROFILE { index.saturating_add(self.axis_offset) } else { index }
     }
 
     /// Gives it the next step, after the one before has ended.

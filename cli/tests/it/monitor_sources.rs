@@ -41,6 +41,21 @@ fn what_cannot_be_read_in_a_file_is_counted_and_the_first_of_it_shown() {
     assert_eq!(view.end(), 0);
 }
 
+/// What is said in the first seconds waits until the protocols are known.
+#[test]
+fn what_a_short_file_says_is_there_at_its_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut log = String::new();
+    for n in 0..4 {
+        writeln!(log, "(1.{n}00000) can0 7E0#0322F19000000000\n(1.{n}10000) can0 7E8#0562F1904142").unwrap();
+    }
+    let file = write(folder.path(), "short.log", &log);
+    let mut view = Terminal::start(&format!("monitor {file} --view nodes"), (120, 24));
+    view.wait_for("ReadDataByIdentifier");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
 #[test]
 fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
     let folder = tempfile::tempdir().unwrap();

@@ -213,6 +213,7 @@ impl Source<'_> {
     {
         let length = Length::unknown();
         let mut is_looked_for = false;
+        let mut is_concluded = false;
         let first_ns = playback.position_ns(start.elapsed());
         let mut latest_ns = i64::MIN;
         // The destination while seeking.
@@ -269,6 +270,11 @@ impl Source<'_> {
             }
             {
                 let mut model = lock(self.model);
+                // Whatever goes back begins anew.
+                if ended && !std::mem::replace(&mut is_concluded, ended) {
+                    model.conclude();
+                }
+                is_concluded = ended;
                 model.unread.clone_from(&progress.unread.borrow());
                 model.source = SourceState::Playing(Playing {
                     factor: playback.factor(),

@@ -29,10 +29,7 @@ impl Rig {
             std::fs::write(folder.join("node.rhai"), node).unwrap();
             "node.rhai".to_owned()
         };
-        let mut listener = Command::new(CANTAP);
-        listener.args(["capture", "-d", &served.at, "-b", "500k", "-t", "5m", "-o", "heard.log"]);
-        let listener =
-            listener.current_dir(folder).stdin(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        let listener = served.record("heard.log");
         let node = served.run_node(&script, &[]);
         Self { served, node, listener }
     }

@@ -29,13 +29,7 @@ const MODEL: [&str; 5] = [
 fn values_by_name_leave_as_single_frames_and_fast_packets_and_are_heard_as_such() {
     let served = Served::start("virtual:load=0", Stdio::null());
     let folder = served.folder.path();
-    let mut listener = Command::new(CANTAP)
-        .args(["capture", "-d", &served.at, "-b", "500k", "-t", "2m", "-o", "heard.log"])
-        .current_dir(folder)
-        .stdin(Stdio::null())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
+    let mut listener = served.record("heard.log");
     let send = |more: &[&str]| {
         let start = ["j1939", "-d", &served.at, "-b", "500k", "--address", "35", "send"];
         let (code, out, err) = cantap(folder, &[&start, more].concat());

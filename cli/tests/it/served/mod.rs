@@ -5,6 +5,8 @@ pub mod server;
 
 use std::io::{BufRead, BufReader};
 use std::process::{Child, Command, Stdio};
+#[cfg(unix)]
+use std::time::{Duration, Instant};
 
 /// A running server. It ends when this is dropped.
 pub struct Served {
@@ -36,6 +38,26 @@ impl Served {
         let way = lines.next().unwrap().unwrap();
         let (host, port) = way.strip_prefix("can://").unwrap().split_once(':').unwrap();
         Self { server, at, socketcand: [host.to_owned(), port.to_owned()], folder }
+    }
+
+    /// Records what is on the bus to a file in the folder, until it is interrupted; returns when it has begun.
+    #[cfg(unix)]
+    pub fn record(&self, file: &str) -> Child {
+        let recorder = Command::new(env!("CARGO_BIN_EXE_cantap"))
+            .args(["capture", "-d", &self.at, "-b", "500k", "-t", "5m", "-o", file])
+            .current_dir(self.folder.path())
+            .stdin(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        // It is there as soon as the channels are open.
+        let path = self.folder.path().join(file);
+        let until = Instant::now() + Duration::from_secs(60);
+        while !path.exists() {
+            assert!(Instant::now() < until, "nothing is recorded to {file}");
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        recorder
     }
 
     /// Runs a script, or a ready node, in the folder; returns when it has begun.

@@ -88,12 +88,16 @@ impl BitTiming {
 
     /// The bit rate in bit/s, rounded, unless it is [`Self::UNKNOWN`].
     pub const fn known_bitrate_bps(&self, clock_hz: u32) -> Option<u32> {
-        if self.clocks_per_bit() == 0 { None } else { Some(self.bitrate_bps(clock_hz)) }
+        let clocks = self.clocks_per_bit();
+        if clocks == 0 { None } else { Some(rate_of(clock_hz, clocks)) }
     }
 
     /// The bit rate in bit/s, rounded; 0 if it is [`Self::UNKNOWN`].
     pub const fn bitrate_bps(&self, clock_hz: u32) -> u32 {
-        rate_of(clock_hz, self.clocks_per_bit())
+        match self.known_bitrate_bps(clock_hz) {
+            Some(rate) => rate,
+            None => 0,
+        }
     }
 
     /// The sample point in per mille of the bit.
@@ -186,10 +190,7 @@ impl BitTiming {
 
 /// The bit rate of a bit that is `clocks` controller clocks long, rounded to whole bit/s.
 const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
-    match clock_hz.saturating_add(clocks / 2).checked_div(clocks) {
-        Some(rate) => rate,
-        None => 0,
-    }
+    clock_hz.saturating_add(clocks / 2) / clocks
 }
 
 #[cfg(test)]

@@ -643,12 +643,18 @@ impl Commands {
     }
 }
 
-/// Checks that a controller can take a configuration. Outside the range of bit rates, the arithmetic of the deadlines does not hold.
+/// Checks that a channel can be opened so.
+#[inline]
 fn check<'q, const N: usize>(config: &ChannelConfig, board: &impl Board<'q, N>) -> Result<(), Refusal> {
-    let timing = &config.timing;
-    if *timing == BitTiming::UNKNOWN && board.needs_no_bit_rate() {
+    if board.needs_no_bit_rate() && config.timing == BitTiming::UNKNOWN {
         return Ok(());
     }
+    check_timing(config)
+}
+
+/// Checks that a controller can take a configuration. Outside the range of bit rates, the arithmetic of the deadlines does not hold.
+fn check_timing(config: &ChannelConfig) -> Result<(), Refusal> {
+    let timing = &config.timing;
     let possible =
         timing.is_valid() && (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&timing.bitrate_bps(CAN_CLOCK_HZ));
     if possible { Ok(()) } else { Err(Refusal::BadTiming) }

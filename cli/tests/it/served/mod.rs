@@ -52,7 +52,7 @@ impl Served {
             .unwrap();
         // It is there as soon as the channels are open.
         let path = self.folder.path().join(file);
-        let until = Instant::now() + Duration::from_secs(60);
+        let until = Instant::now() + Duration::from_mins(1);
         while !path.exists() {
             assert!(Instant::now() < until, "nothing is recorded to {file}");
             std::thread::sleep(Duration::from_millis(5));

@@ -17,52 +17,32 @@ enum Term {
     Measured,
     Negative(Box<Self>),
     Binary(char, Box<Self>, Box<Self>),
-    Function(Function, Vec<Self>),
+    /// By its index in [`FUNCTIONS`].
+    Function(usize, Box<Self>),
+    Power(Box<Self>, Box<Self>),
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Function {
-    One(One),
-    Power,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum One {
-    Abs,
-    Sqrt,
-    Exp,
-    Ln,
-    Log10,
-    Sin,
-    Cos,
-    Tan,
-    Asin,
-    Acos,
-    Atan,
-    Sinh,
-    Cosh,
-    Tanh,
-}
+type Function = fn(f64) -> f64;
 
 /// As tools name them. What `log` is without a number behind it, they do not agree on: it is not evaluated.
 const FUNCTIONS: [(&str, Function); 17] = [
-    ("abs", Function::One(One::Abs)),
-    ("sqrt", Function::One(One::Sqrt)),
-    ("exp", Function::One(One::Exp)),
-    ("ln", Function::One(One::Ln)),
-    ("log10", Function::One(One::Log10)),
-    ("sin", Function::One(One::Sin)),
-    ("cos", Function::One(One::Cos)),
-    ("tan", Function::One(One::Tan)),
-    ("asin", Function::One(One::Asin)),
-    ("acos", Function::One(One::Acos)),
-    ("atan", Function::One(One::Atan)),
-    ("arcsin", Function::One(One::Asin)),
-    ("arccos", Function::One(One::Acos)),
-    ("arctan", Function::One(One::Atan)),
-    ("sinh", Function::One(One::Sinh)),
-    ("cosh", Function::One(One::Cosh)),
-    ("tanh", Function::One(One::Tanh)),
+    ("abs", f64::abs),
+    ("sqrt", f64::sqrt),
+    ("exp", f64::exp),
+    ("ln", f64::ln),
+    ("log10", f64::log10),
+    ("sin", f64::sin),
+    ("cos", f64::cos),
+    ("tan", f64::tan),
+    ("asin", f64::asin),
+    ("acos", f64::acos),
+    ("atan", f64::atan),
+    ("arcsin", f64::asin),
+    ("arccos", f64::acos),
+    ("arctan", f64::atan),
+    ("sinh", f64::sinh),
+    ("cosh", f64::cosh),
+    ("tanh", f64::tanh),
 ];
 
 impl Formula {
@@ -94,29 +74,8 @@ impl Term {
                     _ => left / right,
                 }
             }
-            Self::Function(Function::Power, terms) => match &terms[..] {
-                [base, exponent] => base.value(x).powf(exponent.value(x)),
-                _ => f64::NAN,
-            },
-            Self::Function(Function::One(one), terms) => {
-                let value = terms.first().map_or(f64::NAN, |term| term.value(x));
-                match one {
-                    One::Abs => value.abs(),
-                    One::Sqrt => value.sqrt(),
-                    One::Exp => value.exp(),
-                    One::Ln => value.ln(),
-                    One::Log10 => value.log10(),
-                    One::Sin => value.sin(),
-                    One::Cos => value.cos(),
-                    One::Tan => value.tan(),
-                    One::Asin => value.asin(),
-                    One::Acos => value.acos(),
-                    One::Atan => value.atan(),
-                    One::Sinh => value.sinh(),
-                    One::Cosh => value.cosh(),
-                    One::Tanh => value.tanh(),
-                }
-            }
+            Self::Power(base, exponent) => base.value(x).powf(exponent.value(x)),
+            Self::Function(at, of) => FUNCTIONS[*at].1(of.value(x)),
         }
     }
 }
@@ -193,16 +152,21 @@ impl Parser<'_> {
         if name == "x" || name == "x1" {
             return Some(Term::Measured);
         }
-        let known = FUNCTIONS.iter().find(|(known, _)| *known == name).map(|(_, function)| *function);
-        let function = known.or_else(|| (name == "pow" || name == "power").then_some(Function::Power))?;
-        self.take(&['('])?;
-        let mut terms = vec![self.sum()?];
-        while self.take(&[',']).is_some() {
-            terms.push(self.sum()?);
+        let is_power = name == "pow" || name == "power";
+        let function = FUNCTIONS.iter().position(|(known, _)| *known == name);
+        if !is_power && function.is_none() {
+            return None;
         }
+        self.take(&['('])?;
+        let first = self.sum()?;
+        let term = if let Some(at) = function {
+            Term::Function(at, first.into())
+        } else {
+            self.take(&[','])?;
+            Term::Power(first.into(), self.sum()?.into())
+        };
         self.take(&[')'])?;
-        let wanted = if function == Function::Power { 2 } else { 1 };
-        (terms.len() == wanted).then_some(Term::Function(function, terms))
+        Some(term)
     }
 }
 

@@ -14,7 +14,6 @@ mod conversion;
 mod decode;
 mod encode;
 mod field;
-mod formula;
 mod joined;
 mod layout;
 mod map;

@@ -1,8 +1,8 @@
 #![doc = include_str!("../README.md")]
 //!
 //! A [`TraceRecord`] is one entry of a trace. [`filter`] selects among them, [`playback`] hands them out at their original times, [`diff`] compares
-//! two traces, [`bits`] computes how long a frame is on the bus, [`levels`] what it looks like there, and [`socketcan`] represents events as Linux
-//! does.
+//! two traces, [`bits`] computes how long a frame is on the bus, [`levels`] what it looks like there, [`formula`] reads what
+//! conversions compute, and [`socketcan`] represents events as Linux does.
 
 #![forbid(unsafe_code)]
 
@@ -13,6 +13,7 @@ pub mod diff;
 pub mod event_text;
 mod fd_bits;
 pub mod filter;
+pub mod formula;
 mod frame;
 pub mod grammar;
 mod id_filter;

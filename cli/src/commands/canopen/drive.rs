@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 use cantap_protocols::active::drive::{DriveStep, DriveTiming};
-use cantap_protocols::canopen::drive::{DriveState, data_type, mode_name, mode_named};
+use cantap_protocols::canopen::drive::{DriveState, data_type, mode_name, mode_named, object_of_axis};
 use cantap_protocols::canopen::eds::number;
 use cantap_protocols::canopen::{CanOpen, Sheet, encode};
 use cantap_trace::Seconds;
@@ -170,8 +170,7 @@ fn mode(text: &str) -> Result<i8, String> {
 /// The objects of a node, as its sheet has them.
 struct Objects<'a> {
     node: u8,
-    /// What its objects are above those of the first axis.
-    offset: u16,
+    axis: u8,
     sheet: Option<&'a Sheet>,
 }
 
@@ -179,7 +178,7 @@ impl Objects<'_> {
     /// The bytes of a value, if it fits the object and the limits that the sheet sets.
     fn bytes(&self, index: u16, text: &str) -> anyhow::Result<Vec<u8>> {
         let of_first = index;
-        let index = index + self.offset;
+        let index = object_of_axis(index, self.axis);
         let entry = self.sheet.map(|sheet| sheet.eds.entry_of(index, 0));
         let entry = match entry {
             Some(None) => return Err(usage(format!("the node's sheet has no object {index:04X}"))),
@@ -302,7 +301,7 @@ pub(super) fn run(
     let own = sheets.iter().find(|sheet| sheet.node == Some(args.node));
     let sheet = own.or_else(|| sheets.iter().find(|sheet| sheet.node.is_none()));
     // Everything is checked before anything is sent.
-    let job = args.what.job(&Objects { node: args.node, offset: u16::from(args.axis - 1) * 0x800, sheet })?;
+    let job = args.what.job(&Objects { node: args.node, axis: args.axis, sheet })?;
     let timing = DriveTiming {
         answer_ns,
         confirm_ns: args::nanoseconds(args.confirm),

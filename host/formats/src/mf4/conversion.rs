@@ -1,10 +1,11 @@
 //! Conversions: what the raw value of a channel stands for (ASAM MDF 4.2, conversion block). All types but text to text, which no part of
 //! a bus event can need.
 
+use cantap_trace::formula::{Dialect, Formula};
+
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{Block, u16_at, u64_at};
-use super::formula::Formula;
 use super::value::Value;
 
 /// How deeply a conversion may refer to others.
@@ -86,7 +87,8 @@ impl Conversion {
             2 => Self::Rational(numbers().first_chunk().copied().ok_or_else(short)?),
             3 => {
                 let text = file.text(refs.first().copied().unwrap_or(0))?;
-                let formula = text.parse().map_err(|()| Fault::malformed("a formula", text.as_bytes()))?;
+                let formula = Formula::read(&text, Dialect::Mdf)
+                    .ok_or_else(|| Fault::malformed("a formula", text.as_bytes()))?;
                 Self::Formula(Box::new(formula))
             }
             4 | 5 => {

@@ -1,6 +1,6 @@
 //! From the number in the ECU's memory to the value that it stands for, and back (COMPU_METHOD).
 
-use super::formula::Formula;
+use cantap_trace::formula::Formula;
 
 /// How a number becomes a value.
 #[derive(Clone, Debug, PartialEq)]

@@ -2,11 +2,11 @@
 
 use a2lfile::{A2lFile, A2lObjectName as _, ByteOrderEnum, CharacteristicType, ConversionType, Module};
 use cantap_trace::clean;
+use cantap_trace::formula::{Dialect, Formula};
 use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::conversion::{Conversion, Texts};
 use super::description::Description;
-use super::formula::Formula;
 use super::if_data::EcuConnection;
 use super::nesting::{TooDeep, bounded};
 use super::object::{Bits, DataType, MemoryObject};
@@ -384,8 +384,9 @@ impl Loader<'_> {
             ConversionType::TabNointp => table.and_then(|table| self.points(table, false)),
             ConversionType::TabVerb => table.and_then(|table| self.texts(table)).map(Conversion::Texts),
             ConversionType::Form => method.formula.as_ref().and_then(|formula| {
-                let inverse = formula.formula_inv.as_ref().and_then(|inverse| Formula::read(&inverse.gx));
-                Some(Conversion::Formula(Formula::read(&formula.fx)?, inverse))
+                let inverse =
+                    formula.formula_inv.as_ref().and_then(|inverse| Formula::read(&inverse.gx, Dialect::A2l));
+                Some(Conversion::Formula(Formula::read(&formula.fx, Dialect::A2l)?, inverse))
             }),
         };
         let status = method.status_string_ref.as_ref().and_then(|table| self.texts(&table.conversion_table));

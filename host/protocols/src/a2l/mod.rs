@@ -5,7 +5,6 @@
 
 mod conversion;
 mod description;
-mod formula;
 mod if_data;
 mod load;
 mod nesting;
@@ -15,7 +14,6 @@ mod tests;
 
 pub use conversion::{Conversion, Meaning, Texts};
 pub use description::{A2lDescriptions, Description};
-pub use formula::Formula;
 pub use if_data::{DaqEvent, EcuConnection};
 pub use load::{A2lError, Include};
 pub use object::{Bits, DataType, MemoryObject, ValueError};

@@ -18,13 +18,10 @@ pub use self::step::{DriveStep, DriveTiming, DriveValues};
 use super::Machine;
 use super::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
 use crate::canopen::codec::sdo::SdoObject;
-use crate::canopen::drive::DriveState;
+use crate::canopen::drive::{DriveState, object_of_axis};
 
 /// How often an object is asked for again because frames were lost on the way to this computer.
 const MOST_REPEATS: u32 = 3;
-/// Where the first axis' objects begin, and how far those of the next one are from them (CiA 402-2).
-const FIRST_OF_PROFILE: u16 = 0x6000;
-const AXIS_STEP: u16 = 0x800;
 /// How much later than its period times 2.5 a heartbeat may arrive here.
 const BEAT_GRACE_NS: u64 = 100_000_000;
 
@@ -39,8 +36,8 @@ struct Access {
 #[derive(Clone, Debug)]
 pub struct DriveClient {
     node: u8,
-    /// What its objects are above those of the first axis.
-    axis_offset: u16,
+    /// Of the node, from 1.
+    axis: u8,
     timing: DriveTiming,
     plan: Plan,
     sdo: Option<(Access, SdoClient)>,
@@ -63,7 +60,7 @@ impl DriveClient {
     pub fn new(node: u8, timing: DriveTiming) -> Self {
         Self {
             node,
-            axis_offset: 0,
+            axis: 1,
             timing,
             plan: Plan::new(timing),
             sdo: None,
@@ -81,16 +78,15 @@ impl DriveClient {
         }
     }
 
-    /// For this axis of the node, 1 to 8, each of which has its objects 800h above those of the one before. Steps and results name the
-    /// objects of the first; errors those of the axis.
+    /// For this axis of the node, 1 to 8. Steps and results name the objects of the first; errors those of the axis.
     #[must_use]
     pub fn with_axis(self, axis: u8) -> Self {
-        Self { axis_offset: u16::from(axis.clamp(1, 8) - 1) * AXIS_STEP, ..self }
+        Self { axis, ..self }
     }
 
-    /// An object of the first axis as this one has it. Those of the node are the same for all.
-    pub const fn object(&self, index: u16) -> u16 {
-        if index >= FIRST_OF_PROFILE { index.saturating_add(self.axis_offset) } else { index }
+    /// An object of the first axis as this one has it.
+    pub fn object(&self, index: u16) -> u16 {
+        object_of_axis(index, self.axis)
     }
 
     /// Gives it the next step, after the one before has ended.

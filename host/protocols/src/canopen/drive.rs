@@ -10,6 +10,18 @@ use crate::{Field, Value};
 /// Device types with this number in their low half are drives (object 1000).
 const PROFILE: u32 = 402;
 
+/// Where the objects of drives begin, and how far those of each axis are above those of the one before (CiA 402-2).
+const FIRST_OF_PROFILE: u16 = 0x6000;
+const AXIS_STEP: u16 = 0x800;
+/// A node has no more.
+const MOST_AXES: u8 = 8;
+
+/// An object of the first axis as another of the node's, 1 to 8, has it. Those that are not a drive's are the node's, and the same for all.
+pub fn object_of_axis(index: u16, axis: u8) -> u16 {
+    let offset = u16::from(axis.clamp(1, MOST_AXES) - 1) * AXIS_STEP;
+    if index >= FIRST_OF_PROFILE { index.saturating_add(offset) } else { index }
+}
+
 /// The error code of the last fault.
 pub const ERROR_CODE: u16 = 0x603F;
 /// What the drive is to do.

@@ -18,7 +18,7 @@ fn text(object: Borrowed<'_, '_, PyAny>) -> Option<String> {
 }
 
 /// A text that is not what was wanted, in words; it may be long.
-fn wrong(text: &str, words: impl std::fmt::Display) -> PyErr {
+fn not_understood(text: &str, words: impl std::fmt::Display) -> PyErr {
     let words = words.to_string();
     let short: String = text.chars().take(40).collect();
     let more = if short.len() < text.len() { "…" } else { "" };
@@ -91,12 +91,13 @@ impl<'py> FromPyObject<'_, 'py> for BitRate {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         if let Some(text) = text(object) {
-            let rate = text.parse::<ChannelBitrate>().map_err(|error| wrong(&text, error))?;
+            let rate = text.parse::<ChannelBitrate>().map_err(|error| not_understood(&text, error))?;
             return match rate.channel {
                 None => Ok(Self(rate.bitrate_bps)),
-                Some(_) => {
-                    Err(wrong(&text, "the channel is given already; write the bit rate alone, such as 500k"))
-                }
+                Some(_) => Err(not_understood(
+                    &text,
+                    "the channel is given already; write the bit rate alone, such as 500k",
+                )),
             };
         }
         // `5e5` is a float.
@@ -140,7 +141,7 @@ impl<'py> FromPyObject<'_, 'py> for Seconds {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         if let Some(text) = text(object) {
-            let time = grammar::duration(&text).map_err(|error| wrong(&text, error))?;
+            let time = grammar::duration(&text).map_err(|error| not_understood(&text, error))?;
             return Ok(Self(time.as_secs_f64()));
         }
         if object.is_instance_of::<PyDelta>() {
@@ -186,7 +187,7 @@ impl<'py> FromPyObject<'_, 'py> for Identifier {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         if let Some(text) = text(object) {
-            let id = grammar::identifier(&text).map_err(|error| wrong(&text, error))?;
+            let id = grammar::identifier(&text).map_err(|error| not_understood(&text, error))?;
             return Ok(Self { raw: id.raw(), extended: Some(id.is_extended()) });
         }
         match object.extract::<Whole<u32>>() {

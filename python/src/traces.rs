@@ -365,7 +365,7 @@ fn write_trace(
     }
     // A pipe or a device is written to directly.
     let is_file = !path.exists() || path.is_file();
-    let temporary = if is_file { Temporary::beside(path).map_err(failed)? } else { None };
+    let temporary = if is_file { Temporary::next_to(path).map_err(failed)? } else { None };
     let written = temporary.as_ref().map_or(path, |temporary| &temporary.0);
     let mut writer: Box<dyn TraceWriter> = create_writer(written, &options).map_err(failed)?;
     let mut rows = 0;
@@ -386,7 +386,7 @@ fn write_trace(
 struct Temporary(PathBuf);
 
 impl Temporary {
-    fn beside(path: &Path) -> io::Result<Option<Self>> {
+    fn next_to(path: &Path) -> io::Result<Option<Self>> {
         let place = if path.exists() { path.canonicalize()? } else { path.to_owned() };
         let Some(name) = place.file_name() else { return Ok(None) };
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));

@@ -27,26 +27,18 @@ pub struct Args {
 /// What a change needs: the first steps, with the default board's firmware.
 pub fn run(args: &Args) -> Result<()> {
     let steps = if args.only.is_empty() { &Step::TEST } else { &args.only[..] };
-    run_steps(args, steps, Beside::Nothing, &Board::ALL[..1])
+    run_steps(args, steps, false, &Board::ALL[..1])
 }
 
 /// Every step, with every board's firmware.
 pub fn ci(args: &Args) -> Result<()> {
     if !args.only.is_empty() {
-        return run_steps(args, &args.only, Beside::Nothing, &Board::ALL);
+        return run_steps(args, &args.only, false, &Board::ALL);
     }
     let others = [&Step::MEANWHILE[..], &Step::BESIDE_TESTS, &Step::WEEKLY].concat();
     let is_now = |step: &Step| !others.contains(step);
     let steps: Vec<Step> = Step::value_variants().iter().copied().filter(is_now).collect();
-    run_steps(args, &steps, Beside::Everything, &Board::ALL)
-}
-
-/// What runs beside the steps of a run.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Beside {
-    Nothing,
-    /// [`Step::MEANWHILE`] from the beginning, [`Step::BESIDE_TESTS`] from the tests on.
-    Everything,
+    run_steps(args, &steps, true, &Board::ALL)
 }
 
 /// A step that has run.
@@ -59,13 +51,13 @@ struct Done {
     processor: Option<Duration>,
 }
 
-/// Runs the steps one after the other, and others beside them; stops at the first that fails.
-fn run_steps(args: &Args, steps: &[Step], beside: Beside, boards: &[Board]) -> Result<()> {
+/// Runs the steps one after the other, if in parallel with [`Step::MEANWHILE`] from the beginning and with [`Step::BESIDE_TESTS`] from the
+/// tests on; stops at the first that fails.
+fn run_steps(args: &Args, steps: &[Step], in_parallel: bool, boards: &[Board]) -> Result<()> {
     let machine = Machine::new()?;
     let mut done: Vec<Done> = Vec::new();
     let whole = Instant::now();
-    let is_all = beside == Beside::Everything;
-    let begin = |steps: &[Step], priority| is_all.then(|| Meanwhile::begin(steps, priority)).transpose();
+    let begin = |steps: &[Step], priority| in_parallel.then(|| Meanwhile::begin(steps, priority)).transpose();
     let mut meanwhile = begin(&Step::MEANWHILE, Priority::Lowest)?;
     let mut beside_tests = None;
     'steps: for step in steps {

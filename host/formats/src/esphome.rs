@@ -33,7 +33,7 @@ struct Open {
 }
 
 /// What the component says in a line, behind its name; `None` in lines of others.
-fn said(line: &[u8]) -> Option<&[u8]> {
+fn message_of(line: &[u8]) -> Option<&[u8]> {
     let at = memchr::memmem::find(line, b"[canbus:")?;
     let rest = &line[at..];
     let end = memchr::memmem::find(rest, b"]:")?;
@@ -45,7 +45,7 @@ fn said(line: &[u8]) -> Option<&[u8]> {
 
 /// Whether a file has such lines near its beginning, below what ESPHome says when it starts.
 pub(crate) fn is_head(head: &[u8]) -> bool {
-    head.split(|byte| *byte == b'\n').filter_map(said).any(|text| matches!(fields(text), Some(Ok(_))))
+    head.split(|byte| *byte == b'\n').filter_map(message_of).any(|text| matches!(fields(text), Some(Ok(_))))
 }
 
 /// The frame that a line announces.
@@ -89,7 +89,7 @@ impl RowFormat for Decoder {
             None => line,
         };
         self.clock.take(plain, zone);
-        let Some(text) = said(plain) else {
+        let Some(text) = message_of(plain) else {
             return Ok(if plain.is_empty() { Line::Nothing } else { Line::LeftOut(OTHERS) });
         };
         self.has_lines = true;

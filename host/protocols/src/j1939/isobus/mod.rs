@@ -82,7 +82,7 @@ mod tests {
     }
 
     /// What follows the title.
-    fn said(frame: &str) -> String {
+    fn text_of(frame: &str) -> String {
         lines(&[frame]).remove(0).split_once(" > ").unwrap().1.to_owned()
     }
 
@@ -90,28 +90,28 @@ mod tests {
     #[test]
     fn a_terminal_and_its_client_say_what_they_do() {
         assert_eq!(
-            said("14E72680#A8D204FF39300000"),
+            text_of("14E72680#A8D204FF39300000"),
             "38 ECU to VT: change numeric value: pgn 59136, priority 5, function 0xA8 (change numeric value), object 1234, value 12345"
         );
         assert_eq!(
-            said("14E68026#0001D204E8030AFF"),
+            text_of("14E68026#0001D204E8030AFF"),
             "128 VT to ECU: soft key activation: pgn 58880, priority 5, function 0x00 (soft key activation), key_state 1 (pressed), \
              object 1234, parent 1000, key 10"
         );
         assert_eq!(
-            said("14E6FF26#FE80E803FFFF00A8"),
+            text_of("14E6FF26#FE80E803FFFF00A8"),
             "all VT to ECU: VT status: pgn 58880, priority 5, function 0xFE (VT status), active_master 0x80, mask 1000, \
              soft_key_mask 65535 (none), busy 0x00"
         );
         assert_eq!(
-            said("14E68026#A8D2040139300000"),
+            text_of("14E68026#A8D2040139300000"),
             "128 VT to ECU: change numeric value: pgn 58880, priority 5, function 0xA8 (change numeric value), object 1234, errors 0x01, \
              value 12345"
         );
-        assert!(said("14E72680#FF0104FFFFFFFFFF").ends_with("initiating 1, version 4"));
-        assert!(said("14E72680#A0D20401FFFFFFFF").ends_with("object 1234, show 1 (show)"));
+        assert!(text_of("14E72680#FF0104FFFFFFFFFF").ends_with("initiating 1, version 4"));
+        assert!(text_of("14E72680#A0D20401FFFFFFFF").ends_with("object 1234, show 1 (show)"));
         assert!(
-            said("14E72680#B4D204E803FEFF0A").ends_with("parent 1234, object 1000, x -2"),
+            text_of("14E72680#B4D204E803FEFF0A").ends_with("parent 1234, object 1000, x -2"),
             "what is cut is left out"
         );
         // A text in several packets, padded.
@@ -119,7 +119,7 @@ mod tests {
             lines(&["1CEC2680#100A0002FF00E700", "1CEB2680#01B3D20404004F69", "1CEB2680#026C21FFFFFFFFFF"]);
         assert!(text.last().unwrap().contains("object 1234, length 4, text \"Oil!\""), "{text:?}");
         assert!(
-            said("14E72680#7E00000000000000").contains("ECU to VT: pgn"),
+            text_of("14E72680#7E00000000000000").contains("ECU to VT: pgn"),
             "an unknown function stays bytes"
         );
     }
@@ -128,37 +128,37 @@ mod tests {
     #[test]
     fn process_data_has_the_name_the_value_and_the_unit_of_its_ddi() {
         assert_eq!(
-            said("0CCBF780#33004800B0040000"),
+            text_of("0CCBF780#33004800B0040000"),
             "247 process data: value: pgn 51968, priority 3, command 3 (value), element 3, ddi 72 (Actual Volume Content), \
              actual_volume_content 1200 ml"
         );
         assert_eq!(
-            said("0CCB80F7#12000200FFFFFFFF"),
+            text_of("0CCB80F7#12000200FFFFFFFF"),
             "128 process data: request value: pgn 51968, priority 3, command 2 (request value), element 1, \
              ddi 2 (Actual Volume Per Area Application Rate)"
         );
-        assert!(said("0CCB80F7#140001002A000000").ends_with("interval 42 ms"));
-        assert!(said("0CCB80F7#18000100F4010000").ends_with("threshold 5 mm³/m²"));
-        assert!(said("0CCB80F7#1300FEFF05000000").ends_with("ddi 65534, value 5"));
+        assert!(text_of("0CCB80F7#140001002A000000").ends_with("interval 42 ms"));
+        assert!(text_of("0CCB80F7#18000100F4010000").ends_with("threshold 5 mm³/m²"));
+        assert!(text_of("0CCB80F7#1300FEFF05000000").ends_with("ddi 65534, value 5"));
         assert!(
-            said("0CCBFFF7#FEFFFFFF01FF00FF")
+            text_of("0CCBFFF7#FEFFFFFF01FF00FF")
                 .ends_with("command 14 (TC status), status 0x01, task 1 (active)")
         );
-        assert!(said("0CCB80F7#1D0001000203FFFF").ends_with("errors 0x02, acknowledged 3 (value)"));
+        assert!(text_of("0CCB80F7#1D0001000203FFFF").ends_with("errors 0x02, acknowledged 3 (value)"));
         assert!(
-            said("0CCB80F7#1004FF1F00031006")
+            text_of("0CCB80F7#1004FF1F00031006")
                 .ends_with("version 4, options 0x1F, booms 3, sections 16, channels 6")
         );
-        assert!(said("0CCBF780#D1D20400FFFFFFFF").contains("process data: designator changed"));
+        assert!(text_of("0CCBF780#D1D20400FFFFFFFF").contains("process data: designator changed"));
     }
 
     #[test]
     fn functionalities_and_tim_have_names() {
         assert_eq!(
-            said("18FC8E80#FF01020401002AFF"),
+            text_of("18FC8E80#FF01020401002AFF"),
             "all functionalities: pgn 64654, priority 6, functionalities 1, functionality 2 (UT working set), generation 4, options 00"
         );
-        assert!(said("0C2400F0#F90102FFFFFFFFFF").contains("code 0xF9 (client status)"));
+        assert!(text_of("0C2400F0#F90102FFFFFFFFFF").contains("code 0xF9 (client status)"));
     }
 
     #[test]

@@ -323,19 +323,20 @@ class Record:
     @property
     def event(self) -> str:
         """The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`,
-        `disturbed`."""
+        `disturbed`, `lin`."""
     @property
     def detail(self) -> str | None:
-        """Where frames were lost, which error, which state, why not sent."""
+        """Where frames were lost, which error, which state, why not sent, what was wrong with a LIN frame."""
     @property
     def count(self) -> int | None:
-        """Frames lost, errors suppressed, periods that passed."""
+        """Frames lost, errors suppressed, periods that passed; of a disturbance the nanoseconds, 0 if it came to nothing; of a LIN frame its
+        checksum."""
     @property
     def at_least(self) -> bool:
         """Whether more may have been lost."""
     @property
     def id(self) -> int | None:
-        """The frame's identifier."""
+        """The frame's identifier, of a LIN frame too."""
     @property
     def extended(self) -> bool:
         """Whether it has 29 bits."""
@@ -356,7 +357,7 @@ class Record:
         """The frame's length code, as on the bus."""
     @property
     def data(self) -> bytes | None:
-        """The frame's data bytes."""
+        """The frame's data bytes, of a LIN frame too."""
     @property
     def direction(self) -> str | None:
         """`rx` or `tx`, for a frame."""

@@ -3,8 +3,8 @@
 use cantap_columns::FrameColumns;
 use cantap_trace::grammar::any_frame;
 use cantap_trace::{
-    BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, LossStage, TraceEvent, TraceFrame,
-    TraceRecord, TransmitFailure,
+    BusErrorKind, DeviceNs, Direction, FdFrame, Frame as ClassicFrame, LinFault, LinFrame, LossStage,
+    TraceEvent, TraceFrame, TraceRecord, TransmitFailure,
 };
 use pyo3::exceptions::{PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -238,7 +238,7 @@ impl Record {
     }
 
     /// The kind of event: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`,
-    /// `disturbed`.
+    /// `disturbed`, `lin`.
     #[getter]
     fn event(&self) -> &'static str {
         match self.0.event {
@@ -249,10 +249,11 @@ impl Record {
             TraceEvent::State { .. } => "state",
             TraceEvent::TransmitFailed { .. } => "transmit-failed",
             TraceEvent::Disturbed { .. } => "disturbed",
+            TraceEvent::Lin { .. } => "lin",
         }
     }
 
-    /// Where frames were lost, which error, which state, why not sent.
+    /// Where frames were lost, which error, which state, why not sent, what was wrong with a LIN frame.
     #[getter]
     fn detail(&self) -> Option<&'static str> {
         match &self.0.event {
@@ -260,13 +261,15 @@ impl Record {
             TraceEvent::BusError { kind, .. } => kind.map(BusErrorKind::name),
             TraceEvent::State { state, .. } => Some(state.name()),
             TraceEvent::TransmitFailed { reason, .. } => Some(reason.name()),
+            TraceEvent::Lin { frame, .. } => frame.fault.map(LinFault::name),
             TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } | TraceEvent::Disturbed { .. } => {
                 None
             }
         }
     }
 
-    /// Frames lost, errors suppressed, periods that passed; of a disturbance the nanoseconds, 0 if it came to nothing.
+    /// Frames lost, errors suppressed, periods that passed; of a disturbance the nanoseconds, 0 if it came to nothing; of a LIN frame its
+    /// checksum.
     #[getter]
     fn count(&self) -> Option<u32> {
         match self.0.event {
@@ -276,6 +279,7 @@ impl Record {
             TraceEvent::TransmitFailed { reason: TransmitFailure::Overtaken { periods }, .. } => {
                 Some(periods)
             }
+            TraceEvent::Lin { frame, .. } => frame.checksum.map(u32::from),
             _ => None,
         }
     }
@@ -286,10 +290,10 @@ impl Record {
         matches!(self.0.event, TraceEvent::Lost { at_least: true, .. })
     }
 
-    /// The frame's identifier.
+    /// The frame's identifier, of a LIN frame too.
     #[getter]
     fn id(&self) -> Option<u32> {
-        self.frame().map(|frame| frame.id().raw())
+        self.frame().map(|frame| frame.id().raw()).or_else(|| self.0.lin().map(|frame| frame.id().into()))
     }
 
     /// Whether it has 29 bits.
@@ -328,18 +332,20 @@ impl Record {
         self.frame().map(TraceFrame::dlc)
     }
 
-    /// The frame's data bytes.
+    /// The frame's data bytes, of a LIN frame too.
     #[getter]
     fn data<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
-        self.frame().map(|frame| PyBytes::new(py, frame.data()))
+        let data = self.frame().map(TraceFrame::data).or_else(|| self.0.lin().map(LinFrame::data));
+        data.map(|data| PyBytes::new(py, data))
     }
 
     /// `rx` or `tx`, for a frame.
     #[getter]
     fn direction(&self) -> Option<&'static str> {
         match self.0.event {
-            TraceEvent::Frame { direction: Direction::Tx, .. } => Some("tx"),
-            TraceEvent::Frame { .. } => Some("rx"),
+            TraceEvent::Frame { direction, .. } | TraceEvent::Lin { direction, .. } => {
+                Some(if direction == Direction::Tx { "tx" } else { "rx" })
+            }
             _ => None,
         }
     }

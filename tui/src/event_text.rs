@@ -16,6 +16,8 @@ pub fn event_text(event: &TraceEvent) -> String {
         TraceEvent::Lost { .. } => 'L',
         TraceEvent::TransmitFailed { .. } => 'F',
         TraceEvent::Disturbed { .. } => 'D',
+        // It says so itself.
+        TraceEvent::Lin { .. } => return event.to_string(),
     };
     format!("{letter} {event}")
 }

@@ -12,7 +12,6 @@ use cantap_signals::condition::Condition;
 use cantap_signals::named::NamedId;
 use cantap_signals::search::{DataPattern, Search};
 use cantap_signals::{Decoder, SignalValue};
-use cantap_trace::Interface;
 
 use super::decode;
 use crate::completion;
@@ -41,7 +40,7 @@ use cantap_work::terms::failure_text;
                 cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n  \
                 cantap search workshop.log 'uds.sid == 0x22 and uds.nrc'\n\n\
                 A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id, \
-                messages (EngineData; true for its frames), dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > \
+                messages (EngineData; true for its frames), dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, lin, numbers (12, 0x1F), + - * / % & |, == != < <= > \
                 >=, not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == \
                 5 and canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it \
                 what it says.\n\n\
@@ -230,7 +229,7 @@ impl Sink {
             Kind::Nowhere => Ok(()),
             Kind::Trace(writer) => writer.write(record),
             Kind::Text(out) => {
-                write!(out, "({time}) {} ", Interface(record.channel))?;
+                write!(out, "({time}) {} ", record.interface())?;
                 match record.frame() {
                     Some(frame) => write!(out, "{frame}")?,
                     None => write!(out, "{}", describe(&record.event))?,
@@ -306,6 +305,6 @@ fn describe(event: &TraceEvent) -> String {
         }
         TraceEvent::Lost { count, .. } => format!("{count} lost", count = counted(count, "frame")),
         TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_text(*reason)),
-        TraceEvent::Disturbed { .. } => event.to_string(),
+        TraceEvent::Disturbed { .. } | TraceEvent::Lin { .. } => event.to_string(),
     }
 }

@@ -197,10 +197,10 @@ fn what_is_left_out_is_told_by_kind_with_its_share_and_is_in_the_json() {
     let directory = directory("left_out");
     let head = "date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\ninternal events logged\n";
     let frames = "0.1 1 123 Rx d 1 11\n".repeat(6);
-    let lin = "0.2 L1 3e Rx 1 00\n".repeat(3);
+    let lin = "0.2 L1 WakeupReq\n".repeat(3);
     let broken = "0.3 1 12G Rx d 0\n";
     fs::write(directory.join("mixed.asc"), format!("{head}{frames}{lin}{broken}")).unwrap();
-    let words = "1 place could not be read; no part of a CAN trace: LIN frames and events (3); 40.0 % of the file left out";
+    let words = "1 place could not be read; no part of a CAN trace: LIN events other than frames (3); 40.0 % of the file left out";
     let (code, out, err) = cantap(&directory, &["stats", "mixed.asc"]);
     assert_eq!(code, Some(0));
     assert!(out.contains(&format!("not in these figures: {words}")), "{out}");
@@ -214,7 +214,7 @@ fn what_is_left_out_is_told_by_kind_with_its_share_and_is_in_the_json() {
         let object: serde_json::Value = serde_json::from_str(&out).unwrap();
         let times = if arguments[0] == "diff" { 2 } else { 1 };
         assert_eq!(object["issues"], times, "{out}");
-        assert_eq!(object["left_out"]["LIN frames and events"], 3 * times, "{out}");
+        assert_eq!(object["left_out"]["LIN events other than frames"], 3 * times, "{out}");
         let share = &object["missing_pct"];
         let share = share.as_f64().or_else(|| share[0].as_f64()).unwrap();
         assert!((share - 40.0).abs() < 1e-9, "{out}");
@@ -251,4 +251,35 @@ fn fd_frames_have_their_load_only_with_the_data_bit_rate() {
     assert!((found.unwrap() - expected).abs() < 1e-6, "{found:?} {expected}");
     let (found, _) = load(&["-b", "500k", "--data-bitrate", "1:4M", "--data-bitrate", "2M"]);
     assert!(found.unwrap() < expected, "{found:?}");
+}
+
+/// They were counted by kind, and nobody saw them.
+#[test]
+fn frames_of_lin_are_kept_shown_and_found() {
+    let directory = directory("lin");
+    let head = "date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\ninternal events logged\n";
+    let lines = "0.1 1 123 Rx d 1 11\n0.2 Li 3c Rx 2 01 ff  checksum = fe\n0.3 L2 0a TransmErr\n0.4 1 123 Rx d 1 12\n";
+    fs::write(directory.join("mixed.asc"), format!("{head}{lines}")).unwrap();
+    let run = |line: &str| {
+        let (code, out, err) = cantap(&directory, &line.split(' ').collect::<Vec<_>>());
+        assert_eq!(code, Some(0), "{line}: {out}{err}");
+        (out, err)
+    };
+    let (out, _) = run("stats mixed.asc");
+    assert!(out.starts_with("2 frames in"), "{out}");
+    assert!(out.contains("beside them 2 LIN frames, which are in no other figure"), "{out}");
+    let found = ["lin0 LIN frame 3C: 01 FF, checksum FE", "lin1 LIN frame 0A: no response"];
+    for file in ["mixed.blf", "mixed.mf4", "mixed.parquet", "mixed.csv", "mixed.asc"] {
+        if file != "mixed.asc" {
+            let kind = if file.ends_with("csv") { " --to csv-full" } else { "" };
+            let (_, err) = run(&format!("convert mixed.asc {file}{kind}"));
+            assert!(!err.contains("LIN"), "{file}: {err}");
+        }
+        let (out, _) = run(&format!("search {file} lin"));
+        assert!(out.lines().count() == 2 && found.iter().all(|line| out.contains(line)), "{file}: {out}");
+    }
+    let (_, err) = run("convert mixed.asc mixed.log");
+    assert!(err.contains("LIN frames, which this format has no form for (2)"), "{err}");
+    let (out, _) = run("convert mixed.asc can.asc --filter can0");
+    assert!(!fs::read_to_string(directory.join("can.asc")).unwrap().contains("Li "), "{out}");
 }

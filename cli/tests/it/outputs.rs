@@ -110,7 +110,7 @@ fn what_is_missing_is_in_the_json_of_every_command_that_reads_a_trace() {
     let directory = directory("missing");
     let head = "date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\ninternal events logged\n";
     let frames: Vec<_> = (0..60).map(|at| format!("0.{at:02} 1 100 Rx d 4 11 {at:02X} 33 44\n")).collect();
-    let more = "0.7 L1 3e Rx 1 00\n0.7 L1 3e Rx 1 00\n0.8 1 12G Rx d 0\n";
+    let more = "0.7 L1 WakeupReq\n0.7 L1 WakeupReq\n0.8 1 12G Rx d 0\n";
     fs::write(directory.join("mixed.asc"), format!("{head}{}{more}", frames.concat())).unwrap();
     for (line, times) in [
         ("stats mixed.asc", 1),
@@ -129,7 +129,7 @@ fn what_is_missing_is_in_the_json_of_every_command_that_reads_a_trace() {
         let last: serde_json::Value = serde_json::from_str(out.lines().last().unwrap()).unwrap();
         let object = last.get("summary").unwrap_or(&last);
         assert_eq!(object["issues"], times, "{line}: {out}");
-        assert_eq!(object["left_out"]["LIN frames and events"], 2 * times, "{line}: {out}");
+        assert_eq!(object["left_out"]["LIN events other than frames"], 2 * times, "{line}: {out}");
         let share = &object["missing_pct"];
         let share = share.as_f64().or_else(|| share[0].as_f64()).unwrap();
         assert!((share - 300.0 / 63.0).abs() < 1e-9, "{line}: {out}");

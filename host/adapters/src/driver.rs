@@ -292,7 +292,9 @@ impl Incoming {
             TraceEvent::Lost { stage, count, at_least } => {
                 Self::Lost { channel, stage: stage.unwrap_or(LossStage::Link), count, at_least, at }
             }
-            TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => return None,
+            TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } | TraceEvent::Lin { .. } => {
+                return None;
+            }
         })
     }
 }

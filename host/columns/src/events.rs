@@ -6,7 +6,7 @@ use arrow_array::ArrayRef;
 use arrow_array::builder::{BooleanBuilder, TimestampNanosecondBuilder, UInt8Builder, UInt32Builder};
 use arrow_array::types::Int8Type;
 use arrow_schema::{DataType, Field, TimeUnit};
-use cantap_trace::{BusErrorKind, ErrorState, LossStage, TraceEvent, TraceRecord, TransmitFailure};
+use cantap_trace::{BusErrorKind, ErrorState, LinFault, LossStage, TraceEvent, TraceRecord, TransmitFailure};
 
 use crate::texts::Texts;
 
@@ -20,8 +20,9 @@ pub const SUPPRESSED: &str = "errors-suppressed";
 pub const STATE: &str = "state";
 pub const TRANSMIT_FAILED: &str = "transmit-failed";
 pub const DISTURBED: &str = "disturbed";
+pub const LIN: &str = "lin";
 /// Their order in the column of events, after the table's own.
-const KINDS: [&str; 6] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED, DISTURBED];
+const KINDS: [&str; 7] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED, DISTURBED, LIN];
 
 /// The columns' names and types.
 pub fn fields() -> Vec<Field> {
@@ -75,6 +76,7 @@ impl Events {
         let names =
             LossStage::ALL.map(LossStage::name).into_iter().chain(BusErrorKind::ALL.map(BusErrorKind::name));
         let names = names.chain(ErrorState::ALL.map(ErrorState::name));
+        let names = names.chain(LinFault::ALL.map(LinFault::name));
         for name in names.chain(TransmitFailure::ALL.map(TransmitFailure::name)) {
             if !details.contains(&name) {
                 details.push(name);
@@ -199,6 +201,12 @@ impl Happened {
             TraceEvent::Disturbed { length_ns } => {
                 Self { event: kind(DISTURBED), count: Some(length_ns), ..Self::default() }
             }
+            TraceEvent::Lin { frame, .. } => Self {
+                event: kind(LIN),
+                detail: frame.fault.map(LinFault::name),
+                count: frame.checksum.map(u32::from),
+                ..Self::default()
+            },
         }
     }
 }

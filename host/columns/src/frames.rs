@@ -24,18 +24,18 @@ pub const TX: &str = "tx";
 /// |---|---|---|
 /// | `time` | timestamp\[ns, UTC\] | every row; since 1970, or since the trace's start where no date is known |
 /// | `channel` | uint8, as the trace counts them: from 1 in most formats, from 0 in some | every row |
-/// | `event` | text: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`, `disturbed` | every row |
-/// | `detail` | text: where frames were lost, which error, which state, why not sent | events that say it |
-/// | `count` | uint32: frames lost, errors suppressed, periods overtaken | these |
+/// | `event` | text: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`, `disturbed`, `lin` | every row |
+/// | `detail` | text: where frames were lost, which error, which state, why not sent, what was wrong with a LIN frame | events that say it |
+/// | `count` | uint32: frames lost, errors suppressed, periods overtaken; of a LIN frame its checksum | these |
 /// | `at_least` | bool: there may have been more | losses |
 /// | `tec`, `rec` | uint8: the controller's counters | errors and states that say it |
 /// | `tag` | uint32: the request | frames that were not sent |
-/// | `id` | uint32 | frames |
+/// | `id` | uint32 | frames, of LIN too |
 /// | `extended`, `remote`, `fd`, `late` | bool; `late`: the frame ended then or earlier | frames |
 /// | `brs`, `esi` | bool | FD frames |
-/// | `direction` | text: `rx`, `tx` | frames |
+/// | `direction` | text: `rx`, `tx` | frames, of LIN too |
 /// | `dlc` | uint8: the code on the bus, 0 to 15 | frames |
-/// | `data` | binary, 0 to 64 bytes | frames |
+/// | `data` | binary, 0 to 64 bytes | frames, of LIN too |
 /// | `device_ns` | uint64: nanoseconds of the device's own clock, corrected by nothing | records that have it |
 pub struct FrameColumns {
     events: Events,
@@ -93,6 +93,11 @@ impl FrameColumns {
             self.id.append_value(id.raw());
             self.direction.push(i8::from(*direction == Direction::Tx));
             self.dlc.append_value(frame.dlc());
+            self.data.append_value(frame.data());
+        } else if let TraceEvent::Lin { frame, direction } = &record.event {
+            self.id.append_value(frame.id().into());
+            self.direction.push(i8::from(*direction == Direction::Tx));
+            self.dlc.append_null();
             self.data.append_value(frame.data());
         } else {
             self.id.append_null();

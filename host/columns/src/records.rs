@@ -8,12 +8,12 @@ use arrow_array::types::{
 use arrow_array::{Array, BinaryArray, BooleanArray, PrimitiveArray, RecordBatch, StringArray};
 use arrow_schema::DataType;
 use cantap_trace::{
-    BusErrorKind, DeviceNs, Direction, ErrorState, FdFrame, Frame, Id, LossStage, TraceEvent, TraceFrame,
-    TraceRecord, TransmitFailure,
+    BusErrorKind, DeviceNs, Direction, ErrorState, FdFrame, Frame, Id, LinFault, LinFrame, LossStage,
+    TraceEvent, TraceFrame, TraceRecord, TransmitFailure,
 };
 
 use crate::bad::BadColumns;
-use crate::events::{BUS_ERROR, DISTURBED, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
+use crate::events::{BUS_ERROR, DISTURBED, LIN, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
 use crate::foreign::with_our_columns;
 use crate::frames::{FRAME, RX, TX};
 use crate::signals::VALUE;
@@ -198,6 +198,7 @@ impl<'a> Columns<'a> {
                 TraceEvent::TransmitFailed { tag, reason: reason.ok_or("its detail is not a known failure")? }
             }
             DISTURBED => TraceEvent::Disturbed { length_ns: count.unwrap_or(0) },
+            LIN => self.lin(row, detail, count)?,
             VALUE => return Err("it is a decoded value; records are what `read` gives without a database"),
             _ => return Err("its event is not of a known kind"),
         };
@@ -209,6 +210,29 @@ impl<'a> Columns<'a> {
     fn counters(&self, row: usize) -> Option<(u8, u8)> {
         let known = self.tec.is_valid(row) && self.rec.is_valid(row);
         known.then(|| (self.tec.value(row), self.rec.value(row)))
+    }
+
+    fn direction(&self, row: usize) -> Result<Direction, &'static str> {
+        match self.direction.at(row) {
+            None => Ok(Direction::Rx),
+            Some(text) if text.eq_ignore_ascii_case(RX) => Ok(Direction::Rx),
+            Some(text) if text.eq_ignore_ascii_case(TX) => Ok(Direction::Tx),
+            Some(_) => Err("a direction is rx or tx"),
+        }
+    }
+
+    /// A LIN frame; `count` is its checksum.
+    fn lin(&self, row: usize, detail: Option<&str>, count: Option<u32>) -> Result<TraceEvent, &'static str> {
+        let fault =
+            detail.map(|detail| LinFault::from_name(detail).ok_or("its detail is no fault of a LIN frame"));
+        let id = self.id.is_valid(row).then(|| self.id.value(row)).and_then(|id| u8::try_from(id).ok());
+        let data = if self.data.is_valid(row) { self.data.value(row) } else { &[] };
+        let frame = id.and_then(|id| LinFrame::new(id, data));
+        let frame = frame.ok_or("a LIN frame has an identifier up to 3F and at most 8 bytes")?;
+        let checksum =
+            count.map(|count| u8::try_from(count).map_err(|_| "the checksum of a LIN frame is a byte"));
+        let frame = frame.with(checksum.transpose()?, fault.transpose()?);
+        Ok(TraceEvent::Lin { frame, direction: self.direction(row)? })
     }
 
     fn frame(&self, row: usize) -> Result<TraceEvent, &'static str> {
@@ -253,12 +277,7 @@ impl<'a> Columns<'a> {
         if frame.data().len() != bytes.len() || dlc.is_some_and(|dlc| dlc != frame.dlc()) {
             return Err("dlc does not fit the data; it is the code on the bus, such as 9 for 12 bytes");
         }
-        let direction = match self.direction.at(row) {
-            None => Direction::Rx,
-            Some(text) if text.eq_ignore_ascii_case(RX) => Direction::Rx,
-            Some(text) if text.eq_ignore_ascii_case(TX) => Direction::Tx,
-            Some(_) => return Err("a direction is rx or tx"),
-        };
+        let direction = self.direction(row)?;
         Ok(TraceEvent::Frame { frame, direction, late: is(self.late) })
     }
 }

@@ -8,6 +8,7 @@ mod content;
 mod date;
 mod decode;
 mod encode;
+mod lin;
 mod others;
 
 pub(crate) use decode::Decoder;
@@ -53,12 +54,12 @@ const STATES: [(ErrorState, &str); 4] = [
 mod tests {
     use super::super::tests;
     use crate::Format;
-    use cantap_trace::testing::record_or_fd;
+    use cantap_trace::testing::record_lin_or_can;
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1000), 0..20)) {
+        fn any_trace_round_trips(records in prop::collection::vec(record_lin_or_can(1000), 0..20)) {
             prop_assert_eq!(tests::round_trip(Format::Asc, &records), records);
         }
     }
@@ -120,7 +121,7 @@ mod tests {
                        0.3 1 100 Rx d 1 00 01\n0.3 CANFD 1 Px 100 0 0 0 0 0 0 1000\n0.3 CAN 1 Stutus:bus off\n";
         let (log, issues) = as_log(damaged);
         assert_eq!((log.as_str(), issues.len()), ("", 7), "{issues:?}");
-        let others = "0.1 1 OverloadFrame\n0.2 L1 3e Tx 8 00\n0.2 Li 3e Rx 1 00\n0.3 SV: 1 0 1 ::a = 1\n0.4 a := 1\n\
+        let others = "0.1 1 OverloadFrame\n0.2 L1 SleepModeEvent entering\n0.2 Li WakeupReq\n0.3 SV: 1 0 1 ::a = 1\n0.4 a := 1\n\
                       0.5 ETH 1 Rx 60:ff\n0.6 1 Statistic: D 0\n0.7 // words\n0.8 CAN 1 Status:sleeping\n\
                       0.9 1 100 TxRq d 0\n";
         let source = std::io::Cursor::new(format!("{HEAD}{others}"));
@@ -131,13 +132,42 @@ mod tests {
             ("CAN overload frames", 1),
             ("CAN statistics", 1),
             ("Ethernet frames and events", 1),
-            ("LIN frames and events", 2),
+            ("LIN events other than frames", 2),
             ("comments and texts", 1),
             ("environment and system variables", 2),
             ("other states of the controller", 1),
         ];
         assert_eq!(reader.left_out().iter().collect::<Vec<_>>(), expected);
         assert_eq!(reader.notes().iter().count(), 1);
+    }
+
+    /// They were counted and not kept.
+    #[test]
+    fn lin_frames_are_kept_with_what_was_wrong() {
+        let lines = "0.1 Li 3c Rx 8 00 11 22 33 44 55 66 77 slot = 1 state = 2 checksum = 9a header time = 40, full time = 130 SOF = 0.08 CSM = classic\n\
+                     0.2 L2 0a Tx 2 01 ff checksum = f4\n0.3 L12 15 CSErr Rx 1 07 checksum = 7\n0.4 Li 3d TransmErr header time = 40, full time = 130\n\
+                     0.5 Li 3e 8 RcvError: char = 5 StateReason = 1 ShortError = 0 DlcTimeout = 0 HasDatabytes = 1 01 02 SOF = 0.1\n\
+                     0.6 Li 3c TxRq 1 00\n0.7 Li 3c Rx 8 00\n0.8 Li 40 Rx 1 00\n";
+        let (records, issues) = tests::read(Format::Asc, format!("{HEAD}{lines}"));
+        let found: Vec<_> =
+            records.iter().map(|record| format!("{} {}", record.interface(), record.event)).collect();
+        assert_eq!(
+            found,
+            [
+                "lin0 LIN frame 3C: 00 11 22 33 44 55 66 77, checksum 9A",
+                "lin1 LIN frame 0A: 01 FF, checksum F4",
+                "lin11 LIN frame 15: 07, wrong checksum 07",
+                "lin0 LIN frame 3D: no response",
+                "lin0 LIN frame 3E: 01 02, wrong response",
+            ]
+        );
+        assert_eq!(
+            issues,
+            [
+                "test, line 13: expected 8 data bytes, found nothing",
+                "test, line 14: expected an identifier of LIN up to 3F, found '40'"
+            ]
+        );
     }
 
     #[test]

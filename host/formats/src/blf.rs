@@ -9,6 +9,7 @@ mod containers;
 mod decode;
 mod encode;
 mod kinds;
+mod lin;
 mod object;
 mod unpack;
 
@@ -79,7 +80,7 @@ mod tests {
     use super::super::tests;
     use crate::{Format, WriteOptions};
     use cantap_trace::TraceRecord;
-    use cantap_trace::testing::{data_record, record_or_fd};
+    use cantap_trace::testing::{data_record, record_lin_or_can};
     use proptest::prelude::*;
 
     fn file(records: &[TraceRecord]) -> Vec<u8> {
@@ -89,7 +90,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_trace_in_order_round_trips(mut records in prop::collection::vec(record_or_fd(1), 0..20)) {
+        fn any_trace_in_order_round_trips(mut records in prop::collection::vec(record_lin_or_can(1), 0..20)) {
             records.sort_by_key(|record| record.time_ns);
             prop_assert_eq!(tests::round_trip(Format::Blf, &records), records);
         }
@@ -199,7 +200,7 @@ mod tests {
     #[test]
     fn what_is_not_can_is_counted_by_its_kind() {
         let options = crate::ReadOptions::default();
-        let mut bytes = object(11, 1, &[0; 16]);
+        let mut bytes = object(20, 1, &[0; 16]);
         for kind in [71, 71, 92, 3, 200, 115] {
             bytes.extend(&object(kind, 1, &[0; 16])[super::FILE_HEADER_BYTES..]);
         }
@@ -209,11 +210,58 @@ mod tests {
         let expected = [
             ("CAN overload frames", 1),
             ("Ethernet frames and events", 2),
-            ("LIN frames and events", 1),
+            ("LIN events other than frames", 1),
             ("comments and texts", 1),
             ("objects of other kinds", 1),
         ];
         assert_eq!(reader.left_out().iter().collect::<Vec<_>>(), expected);
+    }
+
+    /// They were counted and not kept: of both generations of objects.
+    #[test]
+    fn lin_frames_are_kept_with_what_was_wrong() {
+        let old = |sum: u16| {
+            let [low, high] = sum.to_le_bytes();
+            [2, 0, 0x3C, 3, 1, 2, 3, 0, 0, 0, 0, 0, 9, 9, 9, 9, low, high, 1, 0]
+        };
+        let mut new = [0; 140];
+        (new[12], new[37], new[38]) = (3, 0x0A, 2);
+        new[112..120].copy_from_slice(&[0xAA, 0xBB, 7, 7, 7, 7, 7, 7]);
+        new[120] = 0x5C;
+        let mut request = new;
+        request[122] = 2;
+        let mut bytes = object(11, 1, &old(0xF9));
+        for (kind, fields) in [
+            (12, &old(0x100)[..]),
+            (14, &old(0)),
+            (15, &old(0)),
+            (57, &new),
+            (57, &request),
+            (60, &new),
+            (58, &new),
+            (61, &new),
+            (57, &new[..100]),
+        ] {
+            bytes.extend(&object(kind, 1, fields)[super::FILE_HEADER_BYTES..]);
+        }
+        let (records, issues) = tests::read(Format::Blf, bytes);
+        let found: Vec<_> =
+            records.iter().map(|record| format!("{} {}", record.interface(), record.event)).collect();
+        assert_eq!(
+            found,
+            [
+                "lin1 LIN frame 3C: 01 02 03, checksum F9",
+                "lin1 LIN frame 3C: 01 02 03, wrong checksum",
+                "lin1 LIN frame 3C: wrong response",
+                "lin1 LIN frame 3C: no response",
+                "lin2 LIN frame 0A: AA BB, checksum 5C",
+                "lin2 LIN frame 0A: AA BB, wrong checksum 5C",
+                "lin2 LIN frame 0A: no response",
+                "lin2 LIN frame 0A: wrong response",
+            ]
+        );
+        assert_eq!(issues.len(), 1, "{issues:?}");
+        assert!(issues[0].contains("at least 123 bytes of fields in an object of type 57"), "{issues:?}");
     }
 
     #[test]

@@ -20,6 +20,9 @@ pub(crate) const PLAIN_BATCH: usize = 4096;
 pub(crate) const REQUESTS_TO_SEND: &str =
     "requests to send were skipped: what was sent is in the trace as sent";
 
+/// LIN events of which a trace has no form: frames are kept.
+pub(crate) const OTHER_LIN: &str = "LIN events other than frames";
+
 /// The reading half of a format.
 pub(crate) trait Decode: Send {
     /// The next record or issue. Errors are the system's.
@@ -130,6 +133,11 @@ pub(crate) trait Encode: Send {
 
     /// Whether the format can say that a frame's time is only an upper bound.
     fn carries_late(&self) -> bool {
+        false
+    }
+
+    /// Whether the format can say what was on a LIN bus.
+    fn carries_lin(&self) -> bool {
         false
     }
 

@@ -192,7 +192,7 @@ mod tests {
     use super::*;
     use crate::{Format, WriteOptions};
     use cantap_trace::Direction;
-    use cantap_trace::testing::{record, record_or_fd, with_device_time};
+    use cantap_trace::testing::{record, record_lin_or_can, with_device_time};
     use proptest::prelude::*;
 
     proptest! {
@@ -224,7 +224,7 @@ mod tests {
 
         #[test]
         fn our_own_dialect_keeps_fd_frames_and_the_devices_time(
-            records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..20),
+            records in prop::collection::vec(with_device_time(record_lin_or_can(1)), 0..20),
         ) {
             prop_assert_eq!(tests::round_trip(Format::Csv(CsvDialect::Full), &records), records);
         }

@@ -1,11 +1,15 @@
 //! Events as words, for formats that allow comments but have no form for these events: `lost 5+
 //! queue`, `bus-error stuff tec=8 rec=0`, `state passive`, `errors-suppressed 17`,
-//! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`, `disturbed 6000` (ns).
+//! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`, `disturbed 6000` (ns),
+//! `lin 3C tx 01FF checksum=C2`, `lin 0A rx fault=no-response`.
 
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_trace::{BusErrorKind, ErrorState, LossStage, TraceEvent, TransmitFailure};
+use super::text;
+use cantap_trace::{
+    BusErrorKind, Direction, ErrorState, LinFault, LinFrame, LossStage, TraceEvent, TransmitFailure,
+};
 
 /// Marks such a text in a comment.
 pub(crate) const MARK: &str = "cantap: ";
@@ -39,6 +43,19 @@ impl fmt::Display for EventText {
                 }
             }
             TraceEvent::Disturbed { length_ns } => write!(f, "disturbed {length_ns}")?,
+            TraceEvent::Lin { frame, direction } => {
+                let way = if *direction == Direction::Tx { "tx" } else { "rx" };
+                write!(f, "lin {:02X} {way}", frame.id())?;
+                for (at, byte) in frame.data().iter().enumerate() {
+                    write!(f, "{}{byte:02X}", if at == 0 { " " } else { "" })?;
+                }
+                if let Some(checksum) = frame.checksum {
+                    write!(f, " checksum={checksum:02X}")?;
+                }
+                if let Some(fault) = frame.fault {
+                    write!(f, " fault={}", fault.name())?;
+                }
+            }
         }
         if let TraceEvent::BusError { counters: Some((tec, rec)), .. }
         | TraceEvent::State { counters: Some((tec, rec)), .. } = &self.0
@@ -64,6 +81,9 @@ impl FromStr for EventText {
 fn parse(text: &str) -> Option<TraceEvent> {
     let mut words = text.split_ascii_whitespace();
     let what = words.next()?;
+    if what == "lin" {
+        return lin(words);
+    }
     let (mut plain, mut tag, mut periods, mut tec, mut rec) = ([None; 2], None, None, None, None);
     for word in words {
         match word.split_once('=') {
@@ -108,6 +128,32 @@ fn parse(text: &str) -> Option<TraceEvent> {
     })
 }
 
+fn lin<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<TraceEvent> {
+    let id = u8::from_str_radix(words.next()?, 16).ok()?;
+    let direction = match words.next()? {
+        "tx" => Direction::Tx,
+        "rx" => Direction::Rx,
+        _ => return None,
+    };
+    let mut frame = LinFrame::new(id, &[])?;
+    for word in words {
+        match word.split_once('=') {
+            Some(("checksum", sum)) => frame.checksum = Some(u8::from_str_radix(sum, 16).ok()?),
+            Some(("fault", name)) => frame.fault = Some(LinFault::from_name(name)?),
+            Some(_) => return None,
+            None => {
+                let pairs = word.as_bytes().chunks(2).map(|pair| match pair {
+                    [high, low] => text::hex_pair(*high, *low),
+                    _ => None,
+                });
+                let data: Vec<u8> = pairs.collect::<Option<_>>()?;
+                frame = LinFrame::new(id, &data)?.with(frame.checksum, frame.fault);
+            }
+        }
+    }
+    Some(TraceEvent::Lin { frame, direction })
+}
+
 /// The event in a text that contains [`MARK`].
 pub(crate) fn marked(text: &[u8]) -> Option<TraceEvent> {
     let at = memchr::memmem::find(text, MARK.as_bytes())?;
@@ -122,12 +168,12 @@ pub(crate) fn push_marked(out: &mut Vec<u8>, event: &TraceEvent) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap_trace::testing::event;
+    use cantap_trace::testing::{event, lin};
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn every_event_round_trips(event in event()) {
+        fn every_event_round_trips(event in prop_oneof![event(), lin()]) {
             let text = EventText(event).to_string();
             prop_assert_eq!(text.parse(), Ok(EventText(event)), "{}", text);
         }

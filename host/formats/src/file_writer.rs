@@ -112,6 +112,10 @@ impl FileWriter {
 impl TraceWriter for FileWriter {
     #[inline]
     fn write(&mut self, record: &TraceRecord) -> io::Result<()> {
+        if record.lin().is_some() && !self.encoder.carries_lin() {
+            self.left_out.note("LIN frames, which this format has no form for");
+            return Ok(());
+        }
         self.has_records = true;
         if matches!(record.event, TraceEvent::Frame { late: true, .. }) && !self.encoder.carries_late() {
             self.left_out.note("the mark of times that are only upper bounds");

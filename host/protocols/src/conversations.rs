@@ -137,6 +137,13 @@ impl Conversations {
         this
     }
 
+    /// The channel has RV-C's groups beside J1939's.
+    pub fn read_rv_c(&mut self, channel: u8) {
+        if let Some(family) = &mut self.family {
+            family.assign_rv_c(channel);
+        }
+    }
+
     /// Goes on with diagnostics that have been read until here.
     pub fn go_on_with(&mut self, diagnostics: Diagnostics) {
         self.readers[OF_DIAGNOSTICS.trailing_zeros() as usize] = Some(Box::new(diagnostics));

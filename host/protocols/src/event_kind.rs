@@ -78,6 +78,10 @@ kinds! {
     Emergency = "emergency",
     /// A PDO.
     Pdo = "pdo",
+    /// A safety-related data object of CANopen: two frames.
+    Srdo = "srdo",
+    /// The command that sends all safety-related nodes of CANopen to their safe state.
+    Failsafe = "failsafe",
     /// An object was read by SDO.
     SdoRead = "sdo_read",
     /// An object was written by SDO.

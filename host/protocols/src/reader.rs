@@ -108,6 +108,11 @@ impl Reader {
             let mut conversations = Conversations::new(&self.options, Some(&protocols));
             let (diagnostics, said) = first.survey.into_diagnostics();
             conversations.go_on_with(diagnostics);
+            for (channel, relative) in &relatives {
+                if matches!(relative, Relative::RvC { .. }) {
+                    conversations.read_rv_c(*channel);
+                }
+            }
             self.conversations = Some(conversations);
             read(ReadItem::Announcement(Announcement::Found { protocols, relatives }))?;
             let mut said = said.into_iter().peekable();

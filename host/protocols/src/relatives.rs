@@ -1,5 +1,5 @@
-//! Related protocols that are recognised but not decoded: OSEK network management, CAN Kingdom, CAL and RV-C, by their
-//! identifiers and what their frames look like.
+//! Related protocols that are recognised but not decoded: OSEK network management, CAN Kingdom and CAL, by their
+//! identifiers and what their frames look like; and RV-C, which is then read with J1939.
 
 mod rv_c;
 
@@ -7,6 +7,8 @@ use std::fmt;
 
 use cantap_trace::TraceFrame;
 use rustc_hash::FxHashMap;
+
+use crate::j1939::rv_c_name;
 
 /// A protocol that is recognised but not decoded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -43,7 +45,7 @@ impl fmt::Display for Relative {
             Self::RvC { examples, groups } => {
                 write!(f, "RV-C ({groups} of its groups")?;
                 for (pgn, mark) in examples.iter().flatten().zip([": ", ", ", ", "]) {
-                    write!(f, "{mark}{pgn:05X} {}", rv_c::name(*pgn).unwrap_or_default())?;
+                    write!(f, "{mark}{pgn:05X} {}", rv_c_name(*pgn).unwrap_or_default())?;
                 }
                 f.write_str(")")
             }
@@ -131,6 +133,11 @@ impl Relatives {
         }
     }
 
+    /// Up to three groups of RV-C, and how many there were, if it is that.
+    pub fn rv_c(&self) -> Option<([Option<u32>; 3], u32)> {
+        self.rv_c.found()
+    }
+
     /// The protocols recognised.
     pub fn found(&self) -> Vec<Relative> {
         let mut found = Vec::new();
@@ -150,7 +157,7 @@ impl Relatives {
         if self.guard.toggled >= ENOUGH {
             found.push(Relative::Cal);
         }
-        found.extend(self.rv_c.found().map(|(examples, groups)| Relative::RvC { examples, groups }));
+        found.extend(self.rv_c().map(|(examples, groups)| Relative::RvC { examples, groups }));
         found
     }
 }

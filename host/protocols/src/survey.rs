@@ -10,7 +10,7 @@ use crate::diagnostics::Diagnostics;
 use crate::iso_tp::KnownPairs;
 use crate::odx::Descriptions;
 use crate::relatives::{Relative, Relatives};
-use crate::signs::Signs;
+use crate::signs::{FAMILY, Signs};
 use crate::{Assembler, Event, EventKind, Protocol, UnderWay};
 
 /// Bytes of a message under way that show ISO 15765-2 even if it is not complete: three frames.
@@ -144,8 +144,14 @@ impl Survey {
                 found.push(Evidence { channel, protocol, messages: 1 });
             }
         }
-        for (&channel, (signs, _)) in &self.channels {
+        for (&channel, (signs, relatives)) in &self.channels {
             found.extend(signs.found(0).map(|(protocol, messages)| Evidence { channel, protocol, messages }));
+            // Read with J1939, of which it may have nothing else.
+            if let Some((_, groups)) = relatives.rv_c()
+                && !found.iter().any(|found| found.channel == channel && FAMILY & found.protocol.bit() != 0)
+            {
+                found.push(Evidence { channel, protocol: Protocol::J1939, messages: groups });
+            }
         }
         found.sort_unstable();
         found

@@ -366,6 +366,7 @@ impl Connection {
             TraceEvent::BusError { .. } => lock(&self.left_out).count("bus errors", 1),
             TraceEvent::State { .. } => lock(&self.left_out).count("changes of state", 1),
             TraceEvent::Disturbed { .. } => lock(&self.left_out).count("disturbances", 1),
+            TraceEvent::Lin { .. } => lock(&self.left_out).count("LIN frames", 1),
         }
     }
 

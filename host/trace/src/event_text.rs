@@ -50,6 +50,7 @@ impl fmt::Display for TraceEvent {
             Self::TransmitFailed { tag, reason } => {
                 write!(f, "frame {tag} not sent: {}", failure_text(reason))
             }
+            Self::Lin { frame, .. } => frame.fmt(f),
             Self::Disturbed { length_ns: 0 } => f.write_str("not disturbed: the device was busy"),
             Self::Disturbed { length_ns } => {
                 write!(f, "disturbed on purpose for {:.1} us", f64::from(length_ns) / 1000.0)

@@ -89,8 +89,11 @@ impl Filter {
     }
 
     /// Whether a record passes. Errors pass if their class is in `#MASK`, or if the filter names only an
-    /// interface. A loss always passes: it says that the trace is incomplete.
+    /// interface. A loss always passes: it says that the trace is incomplete. LIN frames pass filters that name nothing of CAN.
     pub fn accepts(&self, record: &TraceRecord) -> bool {
+        if record.lin().is_some() {
+            return self.channel.is_none() && self.ids.is_empty() && self.errors.is_none();
+        }
         if self.channel.is_some_and(|channel| channel != record.channel) {
             return false;
         }

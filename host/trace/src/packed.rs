@@ -9,7 +9,7 @@ use cantap_can::{BusErrorKind, ErrorState, Frame, Id, LossStage, TransmitFailure
 
 use crate::device_time::DeviceNs;
 use crate::fd::FD_LENGTHS;
-use crate::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use crate::{Direction, FdFrame, LinFault, LinFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Kinds, in the lower four bits.
 const DATA: u8 = 0;
@@ -22,6 +22,7 @@ const TRANSMIT_FAILED: u8 = 6;
 const DISTURBED: u8 = 7;
 /// And the three after it: bit rate switched, sender passive.
 const FD: u8 = 8;
+const LIN: u8 = 12;
 const FD_BRS: u8 = 1;
 const FD_ESI: u8 = 2;
 const KIND: u8 = 15;
@@ -30,6 +31,8 @@ const KIND: u8 = 15;
 const EXTENDED: u8 = 1 << 4;
 const SENT: u8 = 1 << 5;
 const LATE: u8 = 1 << 6;
+/// The checksum of a LIN frame is known.
+const CHECKSUM: u8 = 1 << 4;
 /// Error counters are known.
 const COUNTERS: u8 = 1 << 4;
 /// There may have been more losses.
@@ -126,6 +129,13 @@ fn write_one(record: &TraceRecord, before: &mut Before, out: &mut Vec<u8>) {
         TraceEvent::Disturbed { length_ns } => {
             begin(out, DISTURBED);
             varint(length_ns.into(), out);
+        }
+        TraceEvent::Lin { frame, direction } => {
+            let sent = flag(direction == Direction::Tx, SENT);
+            begin(out, LIN | sent | flag(frame.checksum.is_some(), CHECKSUM));
+            out.extend([frame.id(), place(&LinFault::ALL, frame.fault), frame.data().len() as u8]);
+            out.extend_from_slice(frame.data());
+            out.extend(frame.checksum);
         }
     }
 }
@@ -238,6 +248,7 @@ impl<'a> Rest<'a> {
             Some(DeviceNs::new(time_ns.wrapping_add(before.ahead_ns).cast_unsigned())?)
         };
         let event = match first & KIND {
+            LIN => self.lin(first)?,
             kind @ (DATA | REMOTE | FD..) => self.frame(kind, first)?,
             BUS_ERROR => {
                 TraceEvent::BusError { kind: self.of(&BusErrorKind::ALL)?, counters: self.counters(first)? }
@@ -266,6 +277,14 @@ impl<'a> Rest<'a> {
         Some(TraceRecord { time_ns, device_ns, channel, event })
     }
 
+    fn lin(&mut self, flags: u8) -> Option<TraceEvent> {
+        let (id, fault, len) = (self.byte()?, self.of(&LinFault::ALL)?, self.byte()?);
+        let frame = LinFrame::new(id, self.bytes(len.into())?)?;
+        let checksum = if flags & CHECKSUM == 0 { None } else { Some(self.byte()?) };
+        let direction = if flags & SENT == 0 { Direction::Rx } else { Direction::Tx };
+        Some(TraceEvent::Lin { frame: frame.with(checksum, fault), direction })
+    }
+
     fn frame(&mut self, kind: u8, flags: u8) -> Option<TraceEvent> {
         let raw = self.u32()?;
         let id = if flags & EXTENDED == 0 { Id::standard(raw)? } else { Id::extended(raw)? };
@@ -290,7 +309,7 @@ impl<'a> Rest<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{data_record, record_or_fd, with_device_time};
+    use crate::testing::{data_record, record_lin_or_can, with_device_time};
     use proptest::prelude::*;
 
     fn read_all(bytes: &[u8]) -> (Vec<TraceRecord>, Result<(), Damaged>) {
@@ -301,7 +320,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn records_come_out_as_they_went_in(records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..40)) {
+        fn records_come_out_as_they_went_in(records in prop::collection::vec(with_device_time(record_lin_or_can(1)), 0..40)) {
             let mut bytes = Vec::new();
             write(&records, &mut bytes);
             prop_assert_eq!(read_all(&bytes), (records, Ok(())));
@@ -309,7 +328,7 @@ mod tests {
 
         #[test]
         fn what_is_before_a_cut_is_read_and_the_cut_is_reported(
-            records in prop::collection::vec(with_device_time(record_or_fd(1)), 1..10),
+            records in prop::collection::vec(with_device_time(record_lin_or_can(1)), 1..10),
             cut in any::<prop::sample::Index>(),
         ) {
             let mut bytes = Vec::new();

@@ -1,9 +1,11 @@
 //! One entry of a trace, wherever it comes from: a live device, a file, a simulated bus.
 
+use std::fmt;
+
 use cantap_can::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 
-use crate::TraceFrame;
 use crate::device_time::{DeviceNs, Moment};
+use crate::{Interface, LinFrame, TraceFrame};
 
 /// Whether a frame was received or sent by the device that wrote the trace.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -83,6 +85,14 @@ pub enum TraceEvent {
         /// For how many nanoseconds; 0 if it came to nothing, because the device was busy at that moment.
         length_ns: u32,
     },
+    /// A frame of a LIN bus, in a trace of several buses. The record's channel is the number among the LIN buses: LIN 1 is
+    /// another bus than CAN channel 1.
+    Lin {
+        /// The frame.
+        frame: LinFrame,
+        /// Whether the logger answered the header itself.
+        direction: Direction,
+    },
 }
 
 impl TraceEvent {
@@ -99,6 +109,23 @@ impl TraceRecord {
             TraceEvent::Frame { frame, .. } => Some(frame),
             _ => None,
         }
+    }
+
+    /// The LIN frame, if this is one.
+    pub const fn lin(&self) -> Option<&LinFrame> {
+        match &self.event {
+            TraceEvent::Lin { frame, .. } => Some(frame),
+            _ => None,
+        }
+    }
+
+    /// The name of its bus as programs print it: `can0` for channel 1, `lin0` for LIN 1.
+    pub fn interface(&self) -> impl fmt::Display {
+        let (lin, number) = (self.lin().is_some(), self.channel);
+        fmt::from_fn(move |f| match number.checked_sub(1).filter(|_| lin) {
+            Some(number) => write!(f, "lin{number}"),
+            None => write!(f, "{}", Interface(number)),
+        })
     }
 
     /// When it happened, by both clocks.

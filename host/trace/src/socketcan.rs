@@ -76,11 +76,11 @@ fn position<T: PartialEq>(list: &[T], item: Option<T>) -> u8 {
 }
 
 impl ErrorFrame {
-    /// The error frame for an event; `None` for a frame.
+    /// The error frame for an event; `None` for a frame, be it one of LIN.
     pub fn of(event: &TraceEvent) -> Option<Self> {
         let mut data = [0; 8];
         let mut classes = match *event {
-            TraceEvent::Frame { .. } => return None,
+            TraceEvent::Frame { .. } | TraceEvent::Lin { .. } => return None,
             TraceEvent::Lost { stage, count, at_least } => {
                 data[0] = position(&STAGES, stage) | if at_least { AT_LEAST } else { 0 };
                 data[1] = RX_OVERFLOW;

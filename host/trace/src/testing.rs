@@ -5,7 +5,7 @@ use cantap_can::{Frame, Id};
 use proptest::prelude::*;
 
 use crate::fd::FD_LENGTHS;
-use crate::{DeviceNs, Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use crate::{DeviceNs, Direction, FdFrame, LinFault, LinFrame, TraceEvent, TraceFrame, TraceRecord};
 
 fn id() -> impl Strategy<Value = Id> {
     prop_oneof![
@@ -28,7 +28,7 @@ pub fn fd_frame() -> impl Strategy<Value = FdFrame> {
         .prop_map(|(id, brs, esi, data)| FdFrame::new(id, brs, esi, &data).unwrap())
 }
 
-/// Any event but a frame.
+/// Any event but a frame, be it one of CAN or of LIN.
 pub fn event() -> impl Strategy<Value = TraceEvent> {
     let reasons = TransmitFailure::ALL
         .into_iter()
@@ -55,6 +55,19 @@ pub fn event() -> impl Strategy<Value = TraceEvent> {
     ]
 }
 
+/// Any frame of a LIN bus.
+pub fn lin() -> impl Strategy<Value = TraceEvent> {
+    let data = prop::collection::vec(any::<u8>(), 0..=8);
+    let fault = prop::option::of(prop::sample::select(LinFault::ALL.to_vec()));
+    let direction = prop::sample::select(vec![Direction::Rx, Direction::Tx]);
+    (0..=LinFrame::MAX_ID, data, any::<Option<u8>>(), fault, direction).prop_map(
+        |(id, data, checksum, fault, direction)| {
+            let frame = LinFrame::new(id, &data).unwrap().with(checksum, fault);
+            TraceEvent::Lin { frame, direction }
+        },
+    )
+}
+
 /// A data frame at a given time.
 pub fn data_record(time_ns: i64) -> TraceRecord {
     let frame = "123#DEADBEEF".parse().unwrap();
@@ -73,6 +86,12 @@ pub fn record_or_fd(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
         prop_oneof![frame().prop_map(TraceFrame::from), fd_frame().prop_map(TraceFrame::from)],
         resolution_ns,
     )
+}
+
+/// Like [`record_or_fd`], but including LIN frames.
+pub fn record_lin_or_can(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
+    (record_or_fd(resolution_ns), prop::option::weighted(0.2, lin()))
+        .prop_map(|(record, lin)| TraceRecord { event: lin.unwrap_or(record.event), ..record })
 }
 
 /// The same records, some of which have the device's own time.

@@ -34,7 +34,9 @@ fn found(protocols: &[Evidence], relatives: &[(u8, Relative)]) -> Vec<String> {
         }
     }
     let relatives = relatives.iter().map(|(channel, relative)| {
-        format!("channel {channel} has {relative}, which is recognised and not read")
+        let is_read = matches!(relative, Relative::RvC { .. });
+        let what = if is_read { "which is read with J1939" } else { "which is recognised and not read" };
+        format!("channel {channel} has {relative}, {what}")
     });
     let spoken =
         channels.into_iter().map(|(channel, names)| format!("channel {channel} speaks {}", names.join(", ")));

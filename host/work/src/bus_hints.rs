@@ -30,7 +30,8 @@ impl BusEvidence {
             // For the start of a channel whose losses are not counted, nothing was on the bus.
             TraceEvent::Lost { stage: None, count: 0, at_least: true }
             | TraceEvent::TransmitFailed { .. }
-            | TraceEvent::Disturbed { .. } => {}
+            | TraceEvent::Disturbed { .. }
+            | TraceEvent::Lin { .. } => {}
             TraceEvent::Lost { count, .. } => self.frames += u64::from(*count).max(1),
             TraceEvent::BusError { kind: Some(kind), .. } => self.errors[index(*kind)] += 1,
             TraceEvent::BusError { kind: None, .. } => self.unknown_errors += 1,

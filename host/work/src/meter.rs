@@ -114,7 +114,10 @@ impl Meter {
             }
             TraceEvent::BusError { .. } => self.bus_errors += 1,
             TraceEvent::ErrorsSuppressed { count } => self.bus_errors += u64::from(*count),
-            TraceEvent::State { .. } | TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => {}
+            TraceEvent::State { .. }
+            | TraceEvent::TransmitFailed { .. }
+            | TraceEvent::Disturbed { .. }
+            | TraceEvent::Lin { .. } => {}
         }
     }
 

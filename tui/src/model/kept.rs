@@ -2,7 +2,7 @@
 
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap::{Direction, Frame, TraceEvent, TraceFrame, TraceRecord};
-use cantap_trace::Moment;
+use cantap_trace::{LinFrame, Moment};
 
 /// A record. What a classical device delivers is kept here; a CAN FD frame elsewhere, by number.
 pub struct Kept {
@@ -19,6 +19,7 @@ enum What {
     Lost { stage: Option<LossStage>, count: u32, at_least: bool },
     TransmitFailed { tag: u32, reason: TransmitFailure },
     Disturbed { length_ns: u32 },
+    Lin { frame: LinFrame, direction: Direction },
     Fd(u32),
 }
 
@@ -37,6 +38,7 @@ impl Kept {
             TraceEvent::Lost { stage, count, at_least } => What::Lost { stage, count, at_least },
             TraceEvent::TransmitFailed { tag, reason } => What::TransmitFailed { tag, reason },
             TraceEvent::Disturbed { length_ns } => What::Disturbed { length_ns },
+            TraceEvent::Lin { frame, direction } => What::Lin { frame, direction },
         };
         Self { at: record.moment(), channel: record.channel, what }
     }
@@ -65,6 +67,7 @@ impl Kept {
             }
             What::TransmitFailed { tag, reason } => TraceEvent::TransmitFailed { tag: *tag, reason: *reason },
             What::Disturbed { length_ns } => TraceEvent::Disturbed { length_ns: *length_ns },
+            What::Lin { frame, direction } => TraceEvent::Lin { frame: *frame, direction: *direction },
             What::Fd(number) => elsewhere(*number)?,
         };
         let Moment { time_ns, device_ns } = self.at;

@@ -196,6 +196,7 @@ fn event_style(event: &TraceEvent, theme: Theme) -> Style {
     match event {
         TraceEvent::Lost { .. } => theme.loss(),
         TraceEvent::State { state: ErrorState::Active, .. } => theme.label(),
+        TraceEvent::Lin { frame, .. } if frame.fault.is_none() => Style::new(),
         _ => theme.error(),
     }
 }

@@ -78,7 +78,7 @@ fn kind(event: &TraceEvent) -> &'static str {
         TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. } => "error",
         TraceEvent::State { .. } => "state",
         TraceEvent::Lost { .. } => "lost",
-        TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } => "other",
+        TraceEvent::TransmitFailed { .. } | TraceEvent::Disturbed { .. } | TraceEvent::Lin { .. } => "other",
     }
 }
 

@@ -23,6 +23,13 @@ pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String
         lost_frames(summary.lost, summary.lost_at_least),
         counted(summary.errors, "error"),
     );
+    if summary.lin_frames > 0 {
+        let _ = writeln!(
+            out,
+            "beside them {}, which are in no other figure",
+            counted(summary.lin_frames, "LIN frame")
+        );
+    }
     if let Some(text) = missing.description() {
         let _ = writeln!(out, "not in these figures: {text}");
     }

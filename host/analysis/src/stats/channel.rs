@@ -215,7 +215,7 @@ impl ChannelStatistics {
                     _ => 1,
                 };
             }
-            TraceEvent::Disturbed { .. } => {}
+            TraceEvent::Disturbed { .. } | TraceEvent::Lin { .. } => {}
         }
     }
 

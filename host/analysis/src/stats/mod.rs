@@ -123,6 +123,7 @@ pub struct Statistics {
     latest: usize,
     /// Channels, from 1, whose bit rate the trace has said.
     learned: Vec<u8>,
+    lin_frames: u64,
 }
 
 impl Statistics {
@@ -161,6 +162,7 @@ impl Statistics {
             channels: Vec::new(),
             latest: 0,
             learned: Vec::new(),
+            lin_frames: 0,
         })
     }
 
@@ -174,6 +176,11 @@ impl Statistics {
     /// is reported when the next frame of its channel comes, or by [`Self::advance_with`].
     #[inline]
     pub fn push_with(&mut self, record: &TraceRecord, mut closed: impl FnMut(&Window)) {
+        if record.lin().is_some() {
+            // Another bus, whatever its number.
+            self.lin_frames += 1;
+            return;
+        }
         let place = match self.channels.get(self.latest) {
             Some(channel) if channel.number == record.channel => self.latest,
             _ => self.find_channel(record),
@@ -181,6 +188,11 @@ impl Statistics {
         self.latest = place;
         self.last_ns = self.last_ns.max(record.time_ns);
         self.channels[place].push(record, &mut closed);
+    }
+
+    /// Frames of LIN buses, which are in no channel's figures.
+    pub const fn lin_frames(&self) -> u64 {
+        self.lin_frames
     }
 
     /// A trace has said a channel's bit rate. It is used from the channel's first record on, unless the options have one or the window is too

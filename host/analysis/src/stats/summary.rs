@@ -16,6 +16,8 @@ pub struct Summary {
     pub lost_at_least: bool,
     /// Errors on all channels.
     pub errors: u64,
+    /// Frames of LIN buses, which are in no other figure.
+    pub lin_frames: u64,
     /// End of the trace's first frame, in seconds since the Unix epoch, or since the trace's start.
     pub first_s: Option<f64>,
     /// End of its last frame.
@@ -261,6 +263,7 @@ impl Summary {
             lost: channels.iter().map(|channel| channel.lost.total).sum(),
             lost_at_least: channels.iter().any(|channel| channel.lost.at_least),
             errors: channels.iter().map(|channel| channel.errors.total).sum(),
+            lin_frames: statistics.lin_frames(),
             first_s: first.map(seconds),
             last_s: last.map(seconds),
             first_ns: first,

@@ -112,6 +112,7 @@ impl<W: Write> McapFile<W> {
         put("tec", happened.counters.map(|(tec, _)| tec.into()));
         put("rec", happened.counters.map(|(_, rec)| rec.into()));
         put("tag", happened.tag.map(Value::from));
+        put("text", record.lin().map(|frame| frame.to_string().into()));
         self.container.message(channel, time_ns, Value::from(object).to_string().as_bytes())
     }
 
@@ -193,10 +194,9 @@ fn add_events<W: Write>(container: &mut Container<W>) -> io::Result<u16> {
     let of = |kind: &str| json!({ "type": kind });
     let properties = json!({
         "channel": of("integer"), "event": of("string"), "detail": of("string"), "count": of("integer"),
-        "at_least": of("boolean"), "tec": of("integer"), "rec": of("integer"), "tag": of("integer"),
+        "at_least": of("boolean"), "tec": of("integer"), "rec": of("integer"), "tag": of("integer"), "text": of("string"),
     });
-    let description =
-        "what happened on the bus besides frames: frames that were lost, errors, states of controllers";
+    let description = "what happened besides CAN frames: frames that were lost, errors, states of controllers, frames of LIN";
     let schema = json!({
         "title": "cantap.Event", "type": "object", "description": description, "properties": properties,
     });

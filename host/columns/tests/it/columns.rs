@@ -9,13 +9,13 @@ use cantap_columns::{FrameColumns, MessageColumns, MessageTables, SignalColumns,
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, Multiplexed, Signal, Source, ValueKind, ValueTable, dbc,
 };
-use cantap_trace::testing::record_or_fd;
+use cantap_trace::testing::record_lin_or_can;
 use cantap_trace::{Direction, FdFrame, Frame, Id, PlainFrame, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
 proptest! {
     #[test]
-    fn every_record_comes_back_from_its_columns(wanted in prop::collection::vec(record_or_fd(1), 0..50)) {
+    fn every_record_comes_back_from_its_columns(wanted in prop::collection::vec(record_lin_or_can(1), 0..50)) {
         let mut columns = FrameColumns::default();
         for record in &wanted {
             columns.push(record);
@@ -248,7 +248,7 @@ proptest! {
     fn tables_of_messages_have_what_each_record_says(
         messages in prop::collection::vec((prop::collection::vec(signal(), 1..4), any::<bool>(), 0u32..3), 1..4),
         chosen in prop::option::of(prop::collection::vec(any::<bool>(), 12)),
-        records in prop::collection::vec((record_or_fd(1), 0usize..4, any::<bool>()), 0..60),
+        records in prop::collection::vec((record_lin_or_can(1), 0usize..4, any::<bool>()), 0..60),
     ) {
         let messages = messages.into_iter().enumerate().map(|(at, (mut signals, extended, id))| {
             let id = if extended { Id::extended(id) } else { Id::standard(id) }.unwrap();

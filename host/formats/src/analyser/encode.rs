@@ -89,7 +89,8 @@ impl RowEncoder {
             TraceEvent::State { .. }
             | TraceEvent::ErrorsSuppressed { .. }
             | TraceEvent::TransmitFailed { .. }
-            | TraceEvent::Disturbed { .. } => {
+            | TraceEvent::Disturbed { .. }
+            | TraceEvent::Lin { .. } => {
                 left_out.note("changes of state and other events, which the analyser's table has no row for");
                 return None;
             }

@@ -1,6 +1,6 @@
 //! What the lines of an ASC file can be.
 
-use cantap_trace::{TraceEvent, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// What a line is.
 pub(super) enum Content {
@@ -32,5 +32,15 @@ impl OnChannel {
             Self::Request => Content::Request,
             Self::LeftOut(what) => Content::LeftOut(what),
         }
+    }
+}
+
+/// Vector writes `Rx` and `Tx`; other programs write `RX` and `TX`, too.
+#[inline]
+pub(super) fn direction(word: &[u8]) -> Option<Direction> {
+    match word {
+        b"Rx" | b"RX" | b"rx" => Some(Direction::Rx),
+        b"Tx" | b"TX" | b"tx" => Some(Direction::Tx),
+        _ => None,
     }
 }

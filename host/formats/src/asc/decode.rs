@@ -14,9 +14,9 @@ use super::super::seek;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
-use super::content::{Content, OnChannel};
+use super::content::{Content, OnChannel, direction};
 use super::date::{date, has_wrong_weekday};
-use super::{FD_FORMAT, REMOTE, STATES, others};
+use super::{FD_FORMAT, REMOTE, STATES, lin, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -174,6 +174,10 @@ impl Decoder {
         let (first, behind) = text::word(rest);
         if let Some(channel) = channel(first) {
             return Ok(self.classical(behind)?.on(time_ns, channel));
+        }
+        if let Some(channel) = lin::channel(first) {
+            let identifier = |word: &[u8]| self.identifier(word).map(|(raw, _)| raw);
+            return Ok(lin::line(behind, identifier, |word| self.byte(word))?.on(time_ns, channel));
         }
         if !matches!(first, b"CAN" | b"CANFD") {
             return others::kind(rest.trim_ascii());
@@ -404,16 +408,6 @@ impl Decoder {
 #[inline]
 fn channel(word: &[u8]) -> Option<u8> {
     text::decimal(word).and_then(|channel| u8::try_from(channel).ok())
-}
-
-/// Vector writes `Rx` and `Tx`; other programs write `RX` and `TX`, too.
-#[inline]
-fn direction(word: &[u8]) -> Option<Direction> {
-    match word {
-        b"Rx" | b"RX" | b"rx" => Some(Direction::Rx),
-        b"Tx" | b"TX" | b"tx" => Some(Direction::Tx),
-        _ => None,
-    }
 }
 
 /// The event for what follows `ErrorFrame`.

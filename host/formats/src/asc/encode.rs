@@ -12,7 +12,7 @@ use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::writer::WriteOptions;
 use super::super::zone::Zone;
-use super::{FD_FORMAT, PASSIVE_SENDER, STATES, SWITCHED_BIT_RATE};
+use super::{FD_FORMAT, PASSIVE_SENDER, STATES, SWITCHED_BIT_RATE, lin};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Writes ASC.
@@ -74,6 +74,10 @@ impl Encoder {
 }
 
 impl Encode for Encoder {
+    fn carries_lin(&self) -> bool {
+        true
+    }
+
     #[inline]
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         let start_ns = match self.start_ns {
@@ -121,6 +125,7 @@ impl Encode for Encoder {
                     out.extend_from_slice(format!(" - TxErr: {tec} RxErr: {rec}").as_bytes());
                 }
             }
+            TraceEvent::Lin { frame, direction } => lin::push(out, record.channel, frame, *direction),
             event => {
                 push_status(out, record.channel);
                 let status = match event {

@@ -6,10 +6,9 @@ use super::super::text;
 use super::content::{Content, OnChannel};
 
 /// Events by the word after their time.
-const KINDS: [(&[&str], &str); 11] = [
+const KINDS: [(&[&str], &str); 10] = [
     (&["ETH"], "Ethernet frames and events"),
     (&["Fr", "FR", "FlexRay"], "FlexRay frames and events"),
-    (&["Li"], "LIN frames and events"),
     (&["SV:", "EV:"], "environment and system variables"),
     (&["CANXL"], "CAN XL frames"),
     (&["Comment:", "Comment", "GMARKER", "AMARKER", "Marker"], "comments and texts"),
@@ -34,14 +33,11 @@ pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     {
         return Ok(Content::LeftOut(what));
     }
-    // LIN and MOST channels have their number after the letters.
+    // MOST channels have their number after the letters.
     let numbered = |letters: &[u8]| {
         let number = first.strip_prefix(letters);
         number.is_some_and(|number| !number.is_empty() && number.iter().all(u8::is_ascii_digit))
     };
-    if numbered(b"L") || numbered(b"LIN") || numbered(b"Li") {
-        return Ok(Content::LeftOut("LIN frames and events"));
-    }
     if first.starts_with(b"MOST") || numbered(b"M") {
         return Ok(Content::LeftOut("MOST frames and events"));
     }

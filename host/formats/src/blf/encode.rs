@@ -11,6 +11,7 @@ use super::super::output::Patch;
 use super::super::sja1000;
 use super::super::writer::WriteOptions;
 use super::super::zone::Zone;
+use super::lin;
 use super::object::KINDS;
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR_EXT, CAN_FD_MESSAGE, CAN_MESSAGE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
@@ -188,6 +189,10 @@ impl Encoder {
 }
 
 impl Encode for Encoder {
+    fn carries_lin(&self) -> bool {
+        true
+    }
+
     #[inline]
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
         if !self.started {
@@ -243,6 +248,11 @@ impl Encode for Encoder {
                 fields[26] = u8::from(counters.is_some());
                 (fields[27], fields[28]) = counters.unwrap_or_default();
                 self.object(CAN_ERROR_EXT, offset_ns, &fields);
+            }
+            TraceEvent::Lin { frame, direction }
+                if let Some((kind, fields)) = lin::object(record.channel, frame, *direction) =>
+            {
+                self.object(kind, offset_ns, &fields);
             }
             event => {
                 self.event_comment(record, offset_ns);

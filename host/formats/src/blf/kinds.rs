@@ -2,6 +2,8 @@
 //!
 //! Numbers from Tobias Lorenz's vector_blf (`ObjectHeaderBase.h`).
 
+use super::super::codec::OTHER_LIN;
+
 const OTHER: &str = "objects of other kinds";
 
 /// Whether an object belongs to one of the groups that are no part of a CAN trace.
@@ -16,7 +18,7 @@ pub(super) fn group(kind: u32) -> &'static str {
         4 => "CAN statistics",
         5 | 96 | 127 | 128 => "triggers and markers",
         6..=9 | 72 => "environment and system variables",
-        11..=21 | 42 | 43 | 54 | 57..=64 | 75 | 87..=89 | 105 => "LIN frames and events",
+        11..=21 | 42 | 43 | 54 | 57..=64 | 75 | 87..=89 | 105 => OTHER_LIN,
         22..=25 | 32..=39 | 67..=70 | 76..=85 | 95 => "MOST frames and events",
         29 | 30 | 40 | 41 | 45 | 47..=50 | 66 => "FlexRay frames and events",
         31 | 44 | 74 => "CAN driver errors",

@@ -8,6 +8,7 @@ use super::super::event_text;
 use super::super::issue::Fault;
 use super::super::sja1000;
 use super::kinds::{group, is_bookkeeping};
+use super::lin;
 use super::{
     CAN_ERROR, CAN_ERROR_EXT, CAN_FD_ERROR_64, CAN_FD_MESSAGE, CAN_FD_MESSAGE_64, CAN_MESSAGE, CAN_MESSAGE2,
     DATA_LOST_END, DIRECTION, EVENT_COMMENT, EXTENDED, FD_FORMAT, FD_PASSIVE_SENDER, FD_SWITCHED_BIT_RATE,
@@ -135,6 +136,9 @@ pub(super) fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content
             event.map_or(Content::LeftOut(group(kind)), |(channel, event)| Content::Event(channel, event))
         }
         DATA_LOST_END => Content::Other,
+        _ if let Some(found) = lin::event(kind, fields) => {
+            found?.map_or(Content::Request, |(channel, event)| Content::Event(channel, event))
+        }
         _ if is_bookkeeping(kind) => Content::Other,
         _ => Content::LeftOut(group(kind)),
     })

@@ -112,6 +112,10 @@ impl Encode for Encoder {
         true
     }
 
+    fn carries_lin(&self) -> bool {
+        true
+    }
+
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         self.0.write(out);
         push_time(out, record.time_ns);

@@ -285,6 +285,10 @@ impl Encoder {
 }
 
 impl Encode for Encoder {
+    fn carries_lin(&self) -> bool {
+        true
+    }
+
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
         if self.head.is_empty() {
             self.begin(record.time_ns, record.device_ns.is_some());
@@ -386,21 +390,21 @@ impl Encode for Encoder {
 mod tests {
     use super::super::super::tests;
     use crate::{Format, WriteOptions};
-    use cantap_trace::testing::{data_record, record_or_fd, with_device_time};
+    use cantap_trace::testing::{data_record, record_lin_or_can, with_device_time};
     use cantap_trace::{Direction, TraceEvent, TraceRecord};
     use proptest::prelude::*;
 
     proptest! {
         /// Times go backwards and dates are before 1970; records need not be in time order.
         #[test]
-        fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1), 0..20)) {
+        fn any_trace_round_trips(records in prop::collection::vec(record_lin_or_can(1), 0..20)) {
             prop_assert_eq!(tests::round_trip(Format::Mf4, &records), records);
         }
 
         /// The first record decides whether there is a place for it.
         #[test]
         fn the_devices_time_is_kept_or_counted(
-            records in prop::collection::vec(with_device_time(record_or_fd(1)), 0..20),
+            records in prop::collection::vec(with_device_time(record_lin_or_can(1)), 0..20),
         ) {
             let options = WriteOptions { format: Some(Format::Mf4), ..WriteOptions::default() };
             let (bytes, left_out) = tests::write_with(&options, &records);

@@ -1,5 +1,6 @@
 //! What an MF4 file says about its groups: which of them carry bus events, and how each part of one is read.
 
+use super::super::codec::OTHER_LIN;
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{Block, u16_at, u32_at, u64_at};
@@ -9,6 +10,7 @@ use super::field::Field;
 use super::map::Map;
 use super::stream::Stream;
 use super::value::Meaning;
+use cantap_trace::LinFault;
 
 /// Group flag: its records have variable length and belong to another group's channel.
 const VARIABLE_LENGTH: u16 = 1;
@@ -24,6 +26,8 @@ pub(super) enum Events {
     Frames,
     RemoteFrames,
     ErrorFrames,
+    /// Frames of LIN, or those with which this was wrong.
+    Lin(Option<LinFault>),
     /// Our own words for events that the standard has no form for.
     Words,
 }
@@ -103,6 +107,7 @@ pub(super) struct BusGroup {
     pub brs: Option<Number>,
     pub esi: Option<Number>,
     pub error_type: Option<Number>,
+    pub checksum: Option<Number>,
     pub device_time: Option<Number>,
     pub words: Option<Field>,
 }
@@ -130,13 +135,17 @@ pub(super) struct Group {
 }
 
 /// The kinds of groups by the names of their channels.
-const FRAMES: [(&str, Result<Events, &str>); 10] = [
+const FRAMES: [(&str, Result<Events, &str>); 14] = [
     ("CAN_DataFrame", Ok(Events::Frames)),
     ("CAN_RemoteFrame", Ok(Events::RemoteFrames)),
     ("CAN_ErrorFrame", Ok(Events::ErrorFrames)),
     (super::WORDS, Ok(Events::Words)),
     ("CAN_OverloadFrame", Err("overload frames")),
-    ("LIN_", Err("events of LIN")),
+    ("LIN_Frame", Ok(Events::Lin(None))),
+    ("LIN_ChecksumError", Ok(Events::Lin(Some(LinFault::Checksum)))),
+    ("LIN_TransmissionError", Ok(Events::Lin(Some(LinFault::NoResponse)))),
+    ("LIN_ReceiveError", Ok(Events::Lin(Some(LinFault::Response)))),
+    ("LIN_", Err(OTHER_LIN)),
     ("FLX_", Err("events of FlexRay")),
     ("ETH_", Err("events of Ethernet")),
     ("MOST_", Err("events of MOST")),
@@ -243,6 +252,7 @@ impl BusGroup {
         let brs = number("BRS", Meaning::Flag)?;
         let esi = number("ESI", Meaning::Flag)?;
         let error_type = number("ErrorType", Meaning::Number)?;
+        let checksum = number("Checksum", Meaning::Number)?;
         let device_time = number(super::DEVICE_TIME, Meaning::Number)?;
         let data_bytes = find("DataBytes");
         let bytes = match data_bytes {
@@ -286,6 +296,7 @@ impl BusGroup {
             brs,
             esi,
             error_type,
+            checksum,
             device_time,
             words,
         };

@@ -6,14 +6,14 @@ use super::super::issue::Fault;
 use super::ERROR_TYPES;
 use super::channel::{Number, Row, Validity};
 use super::layout::{BusGroup, Bytes, Events};
-use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, LinFault, LinFrame, TraceEvent, TraceRecord};
 
 impl BusGroup {
     /// Whether its records alone say everything about their events.
     pub(super) fn says_everything(&self) -> bool {
-        let parts =
-            [&self.bus_channel, &self.ide, &self.dir, &self.edl, &self.brs, &self.esi, &self.error_type];
-        let parts = parts.into_iter().flatten().map(Number::validity);
+        let flags = [&self.ide, &self.dir, &self.edl, &self.brs, &self.esi];
+        let parts = flags.into_iter().chain([&self.bus_channel, &self.error_type, &self.checksum]);
+        let parts = parts.flatten().map(Number::validity);
         let mut validities = parts.chain(self.needed.iter().chain(&self.lengths).copied());
         self.apart.is_empty()
             && self.times.is_none()
@@ -47,6 +47,7 @@ impl BusGroup {
                 let known = ERROR_TYPES.iter().find(|(known, _)| Some(*known) == number);
                 TraceEvent::BusError { kind: known.map(|(_, kind)| *kind), counters: None }
             }),
+            Events::Lin(fault) => self.lin(row, fault)?,
             Events::Words => {
                 let fault = || Fault::malformed("an event such as 'lost 5 queue'", b"other words");
                 self.words(row.record).ok_or_else(fault)?
@@ -54,6 +55,25 @@ impl BusGroup {
         };
         let device_time = self.device_time.as_ref().and_then(|number| number.get(row));
         Ok(TraceRecord { time_ns, device_ns: device_time.and_then(DeviceNs::new), channel, event })
+    }
+
+    /// A frame of LIN. Its length is that of the data that came.
+    fn lin(&self, row: &Row<'_>, fault: Option<LinFault>) -> Result<TraceEvent, Fault> {
+        let number = |number: &Option<Number>| number.as_ref().and_then(|number| number.get(row));
+        let id = number(&self.id).and_then(|id| u8::try_from(id).ok());
+        let here = self.bytes(row);
+        let len =
+            number(&self.data_length).map_or(here.len(), |len| usize::try_from(len).unwrap_or(usize::MAX));
+        let data = if fault == Some(LinFault::NoResponse) { Some(&[][..]) } else { here.get(..len) };
+        let frame = id.zip(data).and_then(|(id, data)| LinFrame::new(id, data));
+        let frame = frame.ok_or_else(|| {
+            let found = format!("{id:?} with {len} of {}", here.len());
+            Fault::malformed("an identifier of LIN up to 3F with at most 8 bytes", found.as_bytes())
+        })?;
+        let checksum = number(&self.checksum).and_then(|sum| u8::try_from(sum).ok());
+        let is_sent = number(&self.dir).is_some_and(|dir| dir != 0);
+        let direction = if is_sent { Direction::Tx } else { Direction::Rx };
+        Ok(TraceEvent::Lin { frame: frame.with(checksum, fault), direction })
     }
 
     fn words(&self, record: &[u8]) -> Option<TraceEvent> {

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use cantap_can::{BusErrorKind, ErrorState, LossStage};
 use cantap_formats::{CsvDialect, Format};
-use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{DeviceNs, Direction, LinFrame, TraceEvent, TraceFrame, TraceRecord};
 use traces::{directory, file_name, read, write};
 
 const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/formats.md");
@@ -86,13 +86,13 @@ fn row(format: Format) -> String {
             // The crate of columns writes it, for the command.
             Format::Parquet => {
                 return format!(
-                    "| {format} | read, written | 1 ns | yes | yes | yes | yes | yes | yes | yes | yes |"
+                    "| {format} | read, written | 1 ns | yes | yes | yes | yes | yes | yes | yes | yes | yes |"
                 );
             }
             Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),
         };
-        return format!("| {format} | read | {times} | {rest} | – |");
+        return format!("| {format} | read | {times} | {rest} | – | – |");
     }
     let step_ns = [1, 1000, 100_000, 1_000_000].into_iter().find(|step_ns| {
         let record = alone(frame("123#11", Direction::Rx), 1);
@@ -152,9 +152,12 @@ fn row(format: Format) -> String {
     let stamped = alone(frame("123#11", Direction::Rx), 1);
     let stamped = TraceRecord { device_ns: DeviceNs::new(7_000_083), ..stamped };
     let of_device = if first_back(format, stamped).device_ns == stamped.device_ns { "yes" } else { "–" };
+    let heard = LinFrame::new(0x3C, &[1, 2]).unwrap().with(Some(0xC2), None);
+    let heard = TraceEvent::Lin { frame: heard, direction: Direction::Tx };
+    let lin = if event(heard) == Some(heard) { "yes" } else { "–" };
     let times = if local { format!("{times}, local") } else { times.to_owned() };
     format!(
-        "| {format} | read, written | {times} | {channel} | {direction} | {remote} | {fd} | {errors} | {states} | {losses} | {of_device} |"
+        "| {format} | read, written | {times} | {channel} | {direction} | {remote} | {fd} | {errors} | {states} | {losses} | {of_device} | {lin} |"
     )
 }
 

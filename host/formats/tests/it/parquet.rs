@@ -14,7 +14,7 @@ use cantap_columns::{FrameColumns, SignalColumns};
 use cantap_formats::{Columns, Format, ReadOptions, open_reader};
 use cantap_signals::{Decoder, Source, dbc};
 use cantap_trace::TraceRecord;
-use cantap_trace::testing::record_or_fd;
+use cantap_trace::testing::record_lin_or_can;
 use proptest::prelude::*;
 
 use crate::traces::{directory, read, split};
@@ -66,7 +66,7 @@ fn lines(records: &[TraceRecord]) -> Vec<String> {
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(40))]
     #[test]
-    fn what_was_written_is_what_is_read(wanted in prop::collection::vec(record_or_fd(1), 0..400)) {
+    fn what_was_written_is_what_is_read(wanted in prop::collection::vec(record_lin_or_can(1), 0..400)) {
         let path = directory("parquet_round_trip").join("a.parquet");
         write_records(&path, &wanted);
         let mut reader = open_reader(&path, &ReadOptions::default()).unwrap();

@@ -1,4 +1,5 @@
-//! CANopen (CiA 301): network management, boot-up, heartbeat and guarding, SYNC, TIME, EMCY, SDO, PDO, LSS (CiA 305).
+//! CANopen (CiA 301): network management, boot-up, heartbeat and guarding, SYNC, TIME, EMCY, SDO, PDO, LSS (CiA 305), SRDO and
+//! GFC (EN 50325-5).
 //!
 //! Whatever repeats is reported only when it changes: a node's state, a heartbeat that stops or resumes, the first SYNC, a counter
 //! that jumps. PDOs have names and values if an EDS or observed SDO transfers define their content.
@@ -14,6 +15,7 @@ mod lss;
 mod names;
 mod node;
 mod pdo;
+mod safety;
 mod sdo;
 mod sdo_channels;
 mod signs;
@@ -36,6 +38,7 @@ use rustc_hash::FxHashMap;
 use self::eds::Eds;
 use self::events::{event, malformed, nothing};
 use self::node::Bus;
+use self::safety::{Known, SafetySheets};
 use self::sdo_channels::{SdoChannel, SdoChannels};
 pub(crate) use self::signs::CanOpenSigns;
 use self::states::{guard, heartbeat, sync};
@@ -68,6 +71,7 @@ pub struct CanOpen {
     sheet_ids: FxHashMap<u16, (u8, u16)>,
     /// And SDO channels beyond the first.
     sheet_channels: SdoChannels,
+    sheet_safety: SafetySheets,
     sweep_ns: i64,
 }
 
@@ -75,6 +79,7 @@ impl CanOpen {
     /// With the nodes' sheets, if any.
     pub fn new(sheets: Vec<Sheet>) -> Self {
         let (mut sheet_ids, mut sheet_channels) = (FxHashMap::default(), SdoChannels::default());
+        let mut sheet_safety = SafetySheets::default();
         for sheet in &sheets {
             let nodes = sheet.node.map_or(1..=127, |node| node..=node);
             for node in nodes {
@@ -83,10 +88,11 @@ impl CanOpen {
                     let ids = pdo::sheet_ids(&sheet.eds, node, sheet.node.is_some());
                     sheet_ids.extend(ids.map(|(id, parameter)| (id, (node, parameter))));
                     sheet_channels.add_sheet(&sheet.eds, node, sheet.node.is_some());
+                    sheet_safety.add_sheet(&sheet.eds, node, sheet.node.is_some());
                 }
             }
         }
-        Self { sheets, sheet_ids, sheet_channels, ..Self::default() }
+        Self { sheets, sheet_ids, sheet_channels, sheet_safety, ..Self::default() }
     }
 
     fn sheet(sheets: &[Sheet], node: u8) -> Option<&Eds> {
@@ -125,6 +131,7 @@ impl CanOpen {
                     events.push(malformed(record, EventKind::Nmt, "network management", fault));
                 }
             }
+            safety::GFC => events.push(safety::global_failsafe(record, data)),
             0x80 => sync(bus, record, data, events),
             0x81..=0xFF => {
                 if let &[low, high, register, ref rest @ ..] = data {
@@ -164,13 +171,18 @@ impl CanOpen {
             }
             LSS_SLAVE => events.extend(bus.lss.response(record, data)),
             LSS_MASTER => events.extend(bus.lss.request(record, data)),
+            0x101..=0x180 if !bus.pdo_ids.contains_key(&id) => {
+                let sheet_of = |node| Self::sheet(sheets, node);
+                let known = Known { sheets: &self.sheet_safety, sheet_of: &sheet_of };
+                bus.safety.take(record, id, data, &known, events);
+            }
             _ if node == 0 => {}
             0x581..=0x5FF | 0x601..=0x67F => {
                 let channel = SdoFrame { node, request: None, from_client: id > 0x600, data };
                 transfers::frame(bus, record, &channel, Self::sheet(sheets, node), events);
             }
             0x701..=0x77F => heartbeat(bus, record, node, data, events),
-            0x180..=0x57F => {
+            0x181..=0x57F => {
                 // Four PDOs in each direction have their own identifiers.
                 let (node, number) = bus.pdo_ids.get(&id).copied().unwrap_or((node, id & 0x780));
                 let entry = bus.nodes.entry(node).or_default();
@@ -191,7 +203,10 @@ impl CanOpen {
     fn sweep(&mut self, now_ns: i64, events: &mut Vec<Event>) {
         self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
         let from = events.len();
+        let sheet_of = |node| Self::sheet(&self.sheets, node);
+        let known = Known { sheets: &self.sheet_safety, sheet_of: &sheet_of };
         for (&channel, bus) in &mut self.buses {
+            bus.safety.sweep(channel, now_ns, &known, events);
             let event = |time_ns: i64, start_ns: i64, node: u8, kind, title: &'static str| Event {
                 time_ns,
                 start_ns,
@@ -284,6 +299,7 @@ impl Assembler for CanOpen {
                 && let Some(bus) = self.buses.get_mut(&record.channel)
             {
                 bus.lss.interrupt();
+                bus.safety.interrupt();
                 bus.sync_counter = None;
                 for node in bus.nodes.values_mut() {
                     node.frames_lost = true;

@@ -5,6 +5,7 @@ use rustc_hash::FxHashMap;
 use super::drive::DriveView;
 use super::lss::Lss;
 use super::pdo::Pdos;
+use super::safety::Safety;
 use super::sdo::{Sdo, SdoTransfer};
 use super::sdo_channels::SdoChannels;
 use super::types::number_of;
@@ -90,6 +91,7 @@ pub struct Bus {
     /// SDO channels beyond the first of each node.
     pub channels: SdoChannels,
     pub lss: Lss,
+    pub safety: Safety,
     pub sync_ns: Option<i64>,
     pub sync_counter: Option<u8>,
 }

@@ -119,51 +119,63 @@ impl Pdos {
             let heard = self.mapped.get(&(mapping, sub)).copied();
             heard.or_else(|| sheet.and_then(|eds| eds.value_of(mapping, sub, node)))
         };
-        let (mut at, mut is_short) = (0, false);
-        for sub in 1..=entry(0).unwrap_or(0).min(64) as u8 {
-            let Some(mapped) = entry(sub) else { break };
-            let (index, of, bits) = ((mapped >> 16) as u16, (mapped >> 8) as u8, (mapped & 0xFF) as usize);
-            if bits == 0 {
-                break;
-            }
-            if at + bits > data.len() * 8 {
-                is_short = true;
-                break;
-            }
-            let mut bytes = cut(data, at, bits);
-            at += bits;
-            // Below 20h it is a type: a placeholder for unused bytes.
-            if index < 0x20 {
-                continue;
-            }
-            known.learn(index, of, bits, &bytes);
-            let drive = known.or_sheet(sheet, node);
-            let entry = sheet.and_then(|eds| eds.entry_of(index, of));
-            let name = entry.map(|entry| entry.name.clone()).filter(|name| !name.is_empty());
-            let of_drive = || drive.is_drive().then(|| names::drive_object(index))?;
-            let name = name.or_else(|| names::object(index).or_else(of_drive).map(str::to_owned));
-            let mut field = Field::bytes(name.unwrap_or_else(|| format!("{index:04X}:{of:02X}")), &[]);
-            let data_type = entry.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
-            let data_type = data_type.or_else(|| drive.is_drive().then(|| drive::data_type(index))?);
-            if types::is_signed(data_type) {
-                extend_sign(&mut bytes, bits);
-            }
-            field.value = types::value(data_type, &bytes);
-            drive.explain(index, of, &bytes, field, &mut event.fields);
-        }
-        let rest = cut(data, at, data.len() * 8 - at);
-        // Fewer than eight bits fill up the last byte.
-        let is_filling = data.len() * 8 - at < 8 && rest[..] == [0];
-        if at == 0 {
-            event.fields.push(Field::bytes("data", data));
-        } else if !rest.is_empty() && !is_filling {
-            // Starting at the first bit that is not mapped.
-            event.fields.push(Field::bytes("rest", &rest));
-        }
-        if is_short {
-            event.trouble = Some(Trouble::Malformed("shorter than what is mapped to it"));
-        }
+        let count = entry(0).unwrap_or(0).min(64) as u8;
+        values((1..=count).map_while(entry), node, data, sheet, known, &mut event);
         event
+    }
+}
+
+/// Adds the values of what is mapped, each by its object, sub-index and number of bits, in this order; what nothing is mapped to as bytes.
+pub fn values(
+    mapped: impl IntoIterator<Item = u32>,
+    node: u8,
+    data: &[u8],
+    sheet: Option<&Eds>,
+    known: &mut DriveView,
+    event: &mut Event,
+) {
+    let (mut at, mut is_short) = (0, false);
+    for mapped in mapped {
+        let (index, of, bits) = ((mapped >> 16) as u16, (mapped >> 8) as u8, (mapped & 0xFF) as usize);
+        if bits == 0 {
+            break;
+        }
+        if at + bits > data.len() * 8 {
+            is_short = true;
+            break;
+        }
+        let mut bytes = cut(data, at, bits);
+        at += bits;
+        // Below 20h it is a type: a placeholder for unused bytes.
+        if index < 0x20 {
+            continue;
+        }
+        known.learn(index, of, bits, &bytes);
+        let drive = known.or_sheet(sheet, node);
+        let entry = sheet.and_then(|eds| eds.entry_of(index, of));
+        let name = entry.map(|entry| entry.name.clone()).filter(|name| !name.is_empty());
+        let of_drive = || drive.is_drive().then(|| names::drive_object(index))?;
+        let name = name.or_else(|| names::object(index).or_else(of_drive).map(str::to_owned));
+        let mut field = Field::bytes(name.unwrap_or_else(|| format!("{index:04X}:{of:02X}")), &[]);
+        let data_type = entry.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
+        let data_type = data_type.or_else(|| drive.is_drive().then(|| drive::data_type(index))?);
+        if types::is_signed(data_type) {
+            extend_sign(&mut bytes, bits);
+        }
+        field.value = types::value(data_type, &bytes);
+        drive.explain(index, of, &bytes, field, &mut event.fields);
+    }
+    let rest = cut(data, at, data.len() * 8 - at);
+    // Fewer than eight bits fill up the last byte.
+    let is_filling = data.len() * 8 - at < 8 && rest[..] == [0];
+    if at == 0 {
+        event.fields.push(Field::bytes("data", data));
+    } else if !rest.is_empty() && !is_filling {
+        // Starting at the first bit that is not mapped.
+        event.fields.push(Field::bytes("rest", &rest));
+    }
+    if is_short {
+        event.trouble = Some(Trouble::Malformed("shorter than what is mapped to it"));
     }
 }
 

@@ -4,6 +4,7 @@
 //! Memory: 256 messages of many frames in progress, each of at most 64 KiB, 64 waiting requests, and a NAME for each of 254 addresses on each
 //! channel.
 
+mod charging;
 mod diagnostics;
 mod fast_packet;
 mod header;
@@ -11,6 +12,7 @@ mod isobus;
 mod name;
 mod names;
 mod parameters;
+mod rv_c;
 #[cfg(test)]
 mod tests;
 pub(crate) mod transport;
@@ -19,6 +21,7 @@ mod trouble_codes;
 pub use fast_packet::{MOST_FAST_BYTES, fast_frames};
 pub use header::Header;
 pub use name::J1939Name;
+pub(crate) use rv_c::name as rv_c_name;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -73,6 +76,8 @@ pub struct J1939 {
     /// Those of all channels, unless each has its own.
     groups: Groups,
     of_channel: Vec<Groups>,
+    /// Channels that have RV-C's groups besides.
+    caravans: Vec<u8>,
     /// The part for NMEA 2000.
     marine: FastPackets,
     transport: LongMessages,
@@ -106,6 +111,16 @@ impl J1939 {
         self.of_channel[usize::from(channel)] = groups;
     }
 
+    /// From now on, the channel has RV-C's groups on the second page.
+    pub(crate) fn assign_rv_c(&mut self, channel: u8) {
+        self.caravans.push(channel);
+    }
+
+    /// The group's name in RV-C, if it is one of a channel that has it.
+    fn rv_c(&self, channel: u8, pgn: u32) -> Option<&'static str> {
+        (pgn > 0xFFFF && self.caravans.contains(&channel)).then(|| rv_c::name(pgn)).flatten()
+    }
+
     fn groups(&self, channel: u8) -> Groups {
         self.of_channel.get(usize::from(channel)).copied().unwrap_or(self.groups)
     }
@@ -124,7 +139,9 @@ impl J1939 {
 
     /// A group's name.
     fn group(&self, channel: u8, pgn: u32) -> Option<&'static str> {
-        names::group(pgn).or_else(|| self.is_marine(channel).then(|| nmea2000::name(pgn)).flatten())
+        self.rv_c(channel, pgn)
+            .or_else(|| names::group(pgn))
+            .or_else(|| self.is_marine(channel).then(|| nmea2000::name(pgn)).flatten())
     }
 
     fn frame(&mut self, record: &TraceRecord, header: Header, data: &[u8], events: &mut Vec<Event>) {
@@ -174,8 +191,8 @@ impl J1939 {
     }
 
     fn event(&self, record: &TraceRecord, header: Header, kind: EventKind) -> Event {
-        let title =
-            names::message(header).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
+        let name = self.rv_c(record.channel, header.pgn).or_else(|| names::message(header));
+        let title = name.map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
         let mut event = Event::new(self.protocol(record.channel, header.pgn), record, kind, title);
         (event.from, event.to) = (party(header.source), party(header.destination));
         event.fields.reserve(4);
@@ -259,6 +276,8 @@ impl J1939 {
             }
             (_, data) => {
                 if !self.signals(record.channel, header, data, &mut event)
+                    && !charging::fields(header, data, &mut event.fields)
+                    && !self.rv_c_fields(record.channel, header.pgn, data, &mut event.fields)
                     && !isobus::fields(header, data, &mut event)
                     && !diagnostics::fields(header.pgn, data, &mut event.fields)
                     && !parameters::fields(header.pgn, data, &mut event.fields)
@@ -290,6 +309,11 @@ impl J1939 {
             });
         }
         true
+    }
+
+    /// Adds the values of a group of RV-C; false if it is none.
+    fn rv_c_fields(&self, channel: u8, pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
+        self.rv_c(channel, pgn).is_some() && rv_c::fields(pgn, data, fields)
     }
 
     /// Adds the fields from NMEA 2000; false if it does not have the group.

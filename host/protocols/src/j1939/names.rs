@@ -26,11 +26,16 @@ const BATTERY_ADDRESS: u8 = 0xF4;
 
 /// A message's name: between a charger and a battery management, groups have other names than elsewhere.
 pub fn message(header: Header) -> Option<&'static str> {
-    let charging = match [header.source, header.destination] {
-        [CHARGER_ADDRESS, BATTERY_ADDRESS] | [BATTERY_ADDRESS, CHARGER_ADDRESS] => CHARGING.get(header.pgn),
-        _ => None,
-    };
+    let charging = is_charging(header).then(|| CHARGING.get(header.pgn)).flatten();
     charging.or_else(|| group(header.pgn))
+}
+
+/// Whether a message is one between a charger and a battery management.
+pub fn is_charging(header: Header) -> bool {
+    matches!(
+        [header.source, header.destination],
+        [CHARGER_ADDRESS, BATTERY_ADDRESS] | [BATTERY_ADDRESS, CHARGER_ADDRESS]
+    )
 }
 
 /// A failure mode identifier (FMI).

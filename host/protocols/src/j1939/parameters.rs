@@ -15,19 +15,19 @@ const GROUP_BYTES: usize = 8;
 
 /// A parameter at its place in a group.
 #[derive(Debug)]
-struct Parameter {
-    pgn: u32,
+pub struct Parameter {
+    pub pgn: u32,
     /// From the lowest bit of the first byte.
-    bit: u32,
-    bits: u32,
+    pub bit: u32,
+    pub bits: u32,
     /// `None` where it is not known.
     spn: Option<u32>,
-    name: &'static str,
-    unit: &'static str,
+    pub name: &'static str,
+    pub unit: &'static str,
     scale: Scale,
     offset: f64,
-    /// The names of its states, from 0 on; empty where a state has none.
-    states: Vec<&'static str>,
+    /// The names of its states, by number.
+    states: Vec<(u32, &'static str)>,
 }
 
 /// The parameters in the order of the table, and where each group's begin and end in it.
@@ -49,7 +49,7 @@ static PARAMETERS: LazyLock<Parameters> = LazyLock::new(|| {
 });
 
 impl Parameter {
-    fn read(line: &'static str) -> Option<Self> {
+    pub fn read(line: &'static str) -> Option<Self> {
         let columns: Vec<&'static str> = line.split(',').collect();
         let &[pgn, bit, bits, spn, name, unit, factor, offset, states] = &columns[..] else { return None };
         Some(Self {
@@ -62,27 +62,31 @@ impl Parameter {
             scale: Scale::read(factor)?,
             offset: offset.parse().ok()?,
             states: match states {
-                "switch" => vec!["off", "on"],
-                "" => Vec::new(),
-                states => states.split('|').collect(),
+                "switch" => states_of("off|on"),
+                "fault" => states_of("normal|fault|not trusted"),
+                "limit" => states_of("normal|too high|too low"),
+                "late" => states_of("normal|timed out|not trusted"),
+                states => states_of(states),
             },
         })
     }
 
-    fn field(&self, data: u64) -> Field {
-        let raw = data >> self.bit & ((1 << self.bits) - 1);
-        match self.indicator(raw) {
+    /// The field of these bits.
+    pub fn field(&self, raw: u64, absence: Option<Absence>) -> Field {
+        match absence {
             Some(Absence::NotAvailable) => Field::missing(self.name),
             Some(Absence::Error) => Field::missing(self.name).meaning(Some("error")),
             Some(Absence::Reserved) => Field::missing(self.name).meaning(Some("reserved")),
-            None if !self.states.is_empty() => {
-                let state = self.states.get(raw as usize).copied().filter(|state| !state.is_empty());
-                Field::number(self.name, raw as i64).meaning(state)
-            }
+            None if !self.states.is_empty() => Field::number(self.name, raw as i64).meaning(self.state(raw)),
             // States by number.
             None if self.bits < 8 => Field::number(self.name, raw as i64),
             None => Field::real(self.name, self.scale.of(raw as f64) + self.offset, self.unit),
         }
+    }
+
+    /// The name of a state.
+    pub fn state(&self, raw: u64) -> Option<&'static str> {
+        self.states.iter().find(|(number, _)| u64::from(*number) == raw).map(|(_, name)| *name)
     }
 
     /// What the bits say in place of a value (SAE J1939-71, ranges of transmitted values).
@@ -104,10 +108,19 @@ impl Parameter {
 
 /// Why there is no value.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Absence {
+pub enum Absence {
     NotAvailable,
     Error,
     Reserved,
+}
+
+/// States by number: `0=off|2=on`, or their names alone from 0 on, where one without a name is empty.
+fn states_of(text: &'static str) -> Vec<(u32, &'static str)> {
+    let states = text.split('|').zip(0..).map(|(state, place)| match state.split_once('=') {
+        Some((number, name)) => (number.parse().unwrap_or(u32::MAX), name),
+        None => (place, state),
+    });
+    states.filter(|(_, name)| !name.is_empty()).collect()
 }
 
 /// Adds the values of a group; false if the table does not have it, or it is not as long as it should be.
@@ -115,7 +128,10 @@ pub fn fields(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> bool {
     let Ok(data) = <[u8; GROUP_BYTES]>::try_from(data) else { return false };
     let Some(&(first, end)) = PARAMETERS.groups.get(&pgn) else { return false };
     let data = u64::from_le_bytes(data);
-    fields.extend(PARAMETERS.all[first..end].iter().map(|parameter| parameter.field(data)));
+    fields.extend(PARAMETERS.all[first..end].iter().map(|parameter| {
+        let raw = data >> parameter.bit & ((1 << parameter.bits) - 1);
+        parameter.field(raw, parameter.indicator(raw))
+    }));
     true
 }
 

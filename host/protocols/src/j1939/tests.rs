@@ -376,3 +376,35 @@ fn readiness_is_read_from_the_bus() {
         "{line}"
     );
 }
+
+/// Where RV-C's groups show, they are read with J1939's: alone, and not elsewhere.
+#[test]
+fn a_caravans_groups_are_read_once_they_show() {
+    let home = [
+        "19FFFD46#01780B01847E3577",
+        "19FEDA96#017CC8FCFFFF04FF",
+        "19FFE096#0101FFFF64C8FFFF",
+        "19FFB79C#0005FFFFFFFFFFFF",
+    ];
+    let lines = |home: &[&str]| {
+        let records: Vec<_> = home
+            .iter()
+            .cycle()
+            .take(16)
+            .enumerate()
+            .map(|(at, frame)| testing::at(at as f64, frame))
+            .collect();
+        let (mut reader, mut events) = (crate::Reader::new(crate::Options::default()), Vec::new());
+        records.iter().for_each(|record| reader.push(record, &mut events));
+        reader.finish(&mut events);
+        events.iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    let all = lines(&home);
+    assert_eq!(all.len(), 16);
+    assert_eq!(
+        all[0],
+        "j1939 70 > all DC_SOURCE_STATUS_1: pgn 131069, priority 6, instance 1 (main house battery bank), \
+         device_priority 120 (battery soc device), dc_voltage 13.35 V, dc_current -5.5 A"
+    );
+    assert_eq!(lines(&home[..3]), Vec::<String>::new());
+}

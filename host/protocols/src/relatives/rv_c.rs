@@ -3,23 +3,14 @@
 use cantap_trace::TraceFrame;
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use crate::j1939::Header;
+use crate::j1939::{Header, rv_c_name as name};
 use crate::nmea2000;
-use crate::table::Table;
-
-const FILE: &str = include_str!("../../data/rv-c.csv");
-static GROUPS: Table = Table::new(FILE, "group");
 
 /// So many different groups show it, with so many messages.
 const GROUPS_ENOUGH: usize = 4;
 const MESSAGES_ENOUGH: u32 = 12;
 /// So many senders and groups are watched for fast packets.
 const MOST_WATCHED: usize = 4096;
-
-/// A group's name.
-pub(super) fn name(pgn: u32) -> Option<&'static str> {
-    GROUPS.get(pgn)
-}
 
 /// Counts on a channel.
 #[derive(Clone, Debug, Default)]
@@ -79,7 +70,6 @@ impl Signs {
 mod tests {
     use super::super::Relative;
     use super::*;
-    use crate::table;
 
     fn found(frames: &[&str]) -> Option<Relative> {
         let mut signs = Signs::default();
@@ -87,12 +77,6 @@ mod tests {
             signs.take(&frame.parse().unwrap());
         }
         signs.found().map(|(examples, groups)| Relative::RvC { examples, groups })
-    }
-
-    #[test]
-    fn every_group_has_a_name() {
-        table::check(FILE, &[&GROUPS]);
-        assert_eq!(name(0x1_FFB7), Some("TANK_STATUS"));
     }
 
     /// Batteries, dimmers, an air conditioner and tanks, as in a motor home.

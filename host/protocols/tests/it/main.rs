@@ -6,6 +6,7 @@ mod cdd_agrees_with_cantools;
 mod odx_agrees_with_odxtools;
 mod protocols_agree_with_peers;
 mod protocols_agree_with_tshark;
+mod protocols_page;
 mod test_buses;
 mod uavcan_agrees_with_peers;
 mod uds_contents_agree_with_py_uds;

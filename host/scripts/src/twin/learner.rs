@@ -92,6 +92,7 @@ impl Learner {
                 return;
             }
             TraceEvent::BusError { .. } => return self.leave_out("errors on the bus"),
+            TraceEvent::Lin { .. } => return self.leave_out("LIN frames"),
             TraceEvent::ErrorsSuppressed { .. }
             | TraceEvent::State { .. }
             | TraceEvent::TransmitFailed { .. }

@@ -52,6 +52,7 @@ pub(super) enum Part {
     Remote,
     Error,
     Lost,
+    Lin,
 }
 
 impl Part {
@@ -63,7 +64,7 @@ impl Part {
             Self::Dlc => ("a DLC", 0..=15),
             Self::Length => ("a frame's length", 0..=FD_MAX_BYTES as u32),
             Self::Group => ("a PGN", 0..=0x3_FFFF),
-            Self::Extended | Self::Remote | Self::Error | Self::Lost => return None,
+            Self::Extended | Self::Remote | Self::Error | Self::Lost | Self::Lin => return None,
         })
     }
 }
@@ -79,6 +80,7 @@ pub(super) fn part(name: &str) -> Option<Part> {
         "rtr" => Part::Remote,
         "error" => Part::Error,
         "lost" => Part::Lost,
+        "lin" => Part::Lin,
         _ => return None,
     })
 }
@@ -91,7 +93,10 @@ fn is_loss(event: &TraceEvent) -> bool {
 pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
     let flag = |flag: bool| Some(f64::from(u8::from(flag)));
     match part {
+        // LIN 1 is another bus than channel 1.
+        Part::Channel if record.lin().is_some() => return None,
         Part::Channel => return Some(record.channel.into()),
+        Part::Lin => return flag(record.lin().is_some()),
         Part::Error => return flag(matches!(record.event, TraceEvent::BusError { .. })),
         Part::Lost => return flag(is_loss(&record.event)),
         _ => {}
@@ -104,7 +109,7 @@ pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
         Part::Extended => flag(frame.id().is_extended()),
         Part::Group => grammar::group_of(frame.id()).map(f64::from),
         Part::Remote => flag(frame.is_remote()),
-        Part::Channel | Part::Error | Part::Lost => None,
+        Part::Channel | Part::Error | Part::Lost | Part::Lin => None,
     }
 }
 

@@ -74,8 +74,13 @@ fn files_of_canedge_loggers_are_read_in_both_layouts_finished_or_not_sorted_or_n
     for (name, file) in files() {
         let (frames, errors, left_out) = read(&name, &file);
         assert_eq!(frames, expected(), "{name}");
-        let expected = if name.starts_with("first") { (1, vec![("events of LIN", 2)]) } else { (0, vec![]) };
-        assert_eq!((errors, left_out), expected, "{name}");
+        // An error frame, and two frames of LIN.
+        let expected = if name.starts_with("first") { 3 } else { 0 };
+        assert_eq!((errors, left_out), (expected, vec![]), "{name}");
+        let (records, _) = tests::read(Format::Mf4, &file);
+        let lin: Vec<_> = records.iter().filter_map(|record| record.lin().map(ToString::to_string)).collect();
+        let expected = "LIN frame 3F: FD FD FD FD FD FD FD FD".to_owned();
+        assert_eq!(lin, if name.starts_with("first") { vec![expected; 2] } else { Vec::new() }, "{name}");
     }
 }
 
@@ -110,7 +115,7 @@ fn asammdf_agrees_about_these_files_and_about_what_it_makes_of_them() {
             let (frames, errors, _) = read(&name, &std::fs::read(path).unwrap());
             let frames: Vec<_> = frames.into_iter().filter(|line| !line.contains("#R")).collect();
             assert_eq!(frames, expected, "{name} {compression}");
-            assert_eq!(errors, usize::from(name.starts_with("first")), "{name} {compression}");
+            assert_eq!(errors, if name.starts_with("first") { 3 } else { 0 }, "{name} {compression}");
         }
     }
 }

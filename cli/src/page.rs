@@ -51,6 +51,15 @@ pub fn find() -> anyhow::Result<String> {
     Ok(page)
 }
 
+/// What a page is told of conversations, besides databases.
+#[derive(Default)]
+pub struct Described {
+    /// Files that describe what is on the bus.
+    pub files: Vec<Carried>,
+    /// Who talks to whom: `Connections` in the page's `api.ts`; null if nothing is known.
+    pub connections: Value,
+}
+
 /// The element with a report: a trace with its databases.
 pub const REPORT: &str = "cantap-report";
 /// The element with what a server has for the page.
@@ -67,7 +76,7 @@ pub fn with(page: &str, element: &str, object: &Value) -> anyhow::Result<String>
 pub fn about_devices(
     addresses: &[Address],
     options: &DatabaseOptions,
-    described: Vec<Carried>,
+    described: Described,
     command: &str,
 ) -> anyhow::Result<Value> {
     let mut databases = databases(&options.paths)?;
@@ -75,7 +84,7 @@ pub fn about_devices(
         let car = Carried::new("car.dbc", cantap_virtual::car::DATABASE.as_bytes())?;
         databases.push(car.with("channel", Value::Null));
     }
-    databases.extend(described);
+    databases.extend(described.files);
     let names: Vec<_> = addresses.iter().map(ToString::to_string).collect();
     let databases: Vec<_> = databases.into_iter().map(Carried::into_object).collect();
     Ok(json!({
@@ -84,6 +93,7 @@ pub fn about_devices(
         "name": names.join(" + "),
         "command": command,
         "databases": databases,
+        "connections": described.connections,
     }))
 }
 

@@ -15,7 +15,7 @@ use serde_json::json;
 use crate::completion;
 use crate::database_args::{DatabaseArgs, load};
 use crate::page::{self, Carried};
-use crate::protocols::DescriptionArgs;
+use crate::protocols::ProtocolArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -37,7 +37,7 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     #[command(flatten)]
-    described: DescriptionArgs,
+    protocol: ProtocolArgs,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), only for that channel. Can be repeated. Without it
     /// there is no bus load.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
@@ -70,7 +70,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Only so that faults are reported here rather than to the reader of the page.
     load(&args.databases.options(), false, args.quiet)?;
     let mut databases = page::databases(&args.databases.options().paths)?;
-    databases.extend(args.described.carried(args.quiet)?);
+    let described = args.protocol.carried(args.quiet)?;
+    databases.extend(described.files);
     let read = trace::read(&args.input)?;
     let mut findings = Vec::new();
     if let Some(against) = &args.against {
@@ -92,6 +93,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         "notes": args.notes,
         "trace": trace.file.into_object(),
         "databases": databases,
+        "connections": described.connections,
         "bitrates": bitrates(args, &read.channels),
         "findings": findings,
         "thinned": trace.thinned,

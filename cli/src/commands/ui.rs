@@ -27,7 +27,7 @@ use crate::database_args::{DatabaseArgs, load};
 use crate::input::resolved;
 use crate::live_args::for_listening;
 use crate::page::{self, Carried};
-use crate::protocols::DescriptionArgs;
+use crate::protocols::ProtocolArgs;
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -62,7 +62,7 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     #[command(flatten)]
-    described: DescriptionArgs,
+    protocol: ProtocolArgs,
     /// Receive only these frames, in candump's syntax; with a database also EngineData. Repeat for any of several. The page can change it.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<NamedFilter>,
@@ -141,12 +141,14 @@ impl Args {
         let options = self.databases.options();
         load(&options, false, self.quiet)?;
         let bitrates: Vec<_> = self.bitrates();
+        let described = self.protocol.carried(self.quiet)?;
         let about = json!({
             "version": 1,
             "kind": "trace",
             "name": name,
             "size": size,
-            "databases": objects(page::databases(&options.paths)?.into_iter().chain(self.described.carried(self.quiet)?)),
+            "databases": objects(page::databases(&options.paths)?.into_iter().chain(described.files)),
+            "connections": described.connections,
             "bitrates": bitrates,
         });
         Ok((Source::Trace(path.to_owned()), about))
@@ -172,7 +174,7 @@ impl Args {
             .map_err(|error| for_listening(error.into(), given, "without a trace to show"))?;
         let options = self.databases.or_of(boards.addresses());
         let decoder = load(&options, false, self.quiet)?;
-        let described = self.described.carried(self.quiet)?;
+        let described = self.protocol.carried(self.quiet)?;
         let about = page::about_devices(boards.addresses(), &options, described, "cantap ui")?;
         let folder = std::env::current_dir().context("there is no working folder for recordings")?;
         let device = Device {

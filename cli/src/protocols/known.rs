@@ -97,7 +97,7 @@ impl Known {
             let mut node = named((channel, protocol, &node));
             let about = json!({
                 "first_s": known.first_ns as f64 / 1e9, "last_s": known.last_ns as f64 / 1e9, "events": known.events,
-                "faults": known.faults, "state": known.state, "missed": known.missed, "period_ms": known.period_ms,
+                "faults": known.faults, "state": known.state, "drive": known.drive, "missed": known.missed, "period_ms": known.period_ms,
                 "identity": known.identity, "codes": known.codes,
             });
             if let (Value::Object(node), Value::Object(about)) = (&mut node, about) {

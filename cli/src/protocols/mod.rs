@@ -10,21 +10,22 @@ use std::sync::Arc;
 use anyhow::Context as _;
 use cantap_protocols::Options;
 use cantap_protocols::calibration::{Known as KnownConnections, MasterSlave};
-use cantap_protocols::dsdl::DsdlSource;
+use cantap_protocols::dsdl::{DsdlSource, SubjectType};
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 use cantap_work::a2l;
-use cantap_work::dsdl::{self, SubjectType};
+use cantap_work::dsdl;
 use cantap_work::odx::{self, OdxPath};
 use cantap_work::reading::Reading;
 use cantap_work::report::Reporter;
 use clap::Arg;
+use serde_json::{Value, json};
 
 pub use self::known::{Known, named};
 pub use self::sheet::SheetPath;
 
-use crate::page::{self, Carried};
+use crate::page::{self, Carried, Described};
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -47,9 +48,9 @@ pub struct ProtocolArgs {
     subjects: Vec<SubjectType>,
 }
 
-/// Files that describe what is on a bus; commands flatten this into their arguments.
+/// Files that describe what is on a bus.
 #[derive(Clone, Debug, Default, clap::Args)]
-pub struct DescriptionArgs {
+struct DescriptionArgs {
     /// The sheet (EDS, DCF, XDD or XDC) of CANopen nodes; with a node's number before it (5:drive.eds), only for that node. Can be
     /// repeated.
     #[arg(long = "eds", value_name = "[NODE:]FILE")]
@@ -68,10 +69,8 @@ pub struct DescriptionArgs {
 }
 
 impl DescriptionArgs {
-    /// The files, to be put into a page. What is not understood in them is reported on standard error, unless `quiet`.
-    pub fn carried(&self, quiet: bool) -> anyhow::Result<Vec<Carried>> {
-        // A page is shown to others: faults belong here.
-        ProtocolArgs { described: self.clone(), ..ProtocolArgs::default() }.options(quiet)?;
+    /// The files, to be put into a page.
+    fn carried(&self) -> anyhow::Result<Vec<Carried>> {
         let bytes =
             |path: &Path| std::fs::read(path).with_context(|| format!("cannot read {}", path.display()));
         let mut carried = Vec::new();
@@ -91,7 +90,7 @@ impl DescriptionArgs {
                 carried.push(Carried::new(&path, text.as_bytes())?);
             }
         }
-        Ok(carried.into_iter().map(|file| file.with("channel", serde_json::Value::Null)).collect())
+        Ok(carried.into_iter().map(|file| file.with("channel", Value::Null)).collect())
     }
 }
 
@@ -104,6 +103,16 @@ fn pair_help() -> String {
 }
 
 impl ProtocolArgs {
+    /// All of it, to be put into a page: files, and who talks to whom. What is not understood in them is reported on standard error, unless `quiet`.
+    pub fn carried(&self, quiet: bool) -> anyhow::Result<Described> {
+        // A page is shown to others: faults belong here.
+        self.options(quiet)?;
+        let connections = json!({
+            "pairs": texts(&self.pairs), "xcp": texts(&self.xcp), "ccp": texts(&self.ccp), "subjects": texts(&self.subjects),
+        });
+        Ok(Described { files: self.described.carried()?, connections })
+    }
+
     /// A reader that collects a trace's nodes and services.
     pub fn known(&self, quiet: bool) -> anyhow::Result<Known> {
         Ok(Known::new(reading(self.options(quiet)?, None, quiet)))
@@ -125,6 +134,10 @@ impl ProtocolArgs {
         let types = dsdl::load(&self.described.dsdl, &self.subjects, &reporter(quiet))?;
         Ok(Options { pairs, sheets, descriptions, calibration, types, ..Options::default() })
     }
+}
+
+fn texts<T: ToString>(all: &[T]) -> Vec<String> {
+    all.iter().map(ToString::to_string).collect()
 }
 
 /// What the libraries report goes to standard error, unless `quiet`.

@@ -109,6 +109,35 @@ fn descriptions_are_in_the_page() {
     assert!(code == Some(1) && text.contains("a.log"), "{text}");
 }
 
+/// Who talks to whom, where the trace does not show it, goes with them, as in other commands.
+#[test]
+fn connections_are_in_the_page() {
+    let directory = directory("connections");
+    std::fs::write(directory.join("a.log"), log(50, 10)).unwrap();
+    let voltage = "1620=uavcan.si.sample.voltage.Scalar.1.0";
+    let named = [
+        "--pair",
+        "6F1/12:612/F1",
+        "--pair",
+        "bmw",
+        "--xcp",
+        "7F0:7F1",
+        "--ccp",
+        "123:124",
+        "--subject",
+        voltage,
+    ];
+    let (code, text) = cantap(&directory, &[&["report", "a.log"][..], &named].concat());
+    assert_eq!(code, Some(0), "{text}");
+    let (report, _) = report(&directory.join("a.html"));
+    let expected = serde_json::json!({
+        "pairs": ["6F1/12:612/F1", "bmw"], "xcp": ["7F0:7F1"], "ccp": ["123:124"], "subjects": [voltage],
+    });
+    assert_eq!(report["connections"], expected);
+    let (code, text) = cantap(&directory, &["report", "a.log", "--subject", "1620=uavcan.Nothing.1.0"]);
+    assert!(code == Some(1) && text.contains("uavcan.Nothing.1.0"), "{text}");
+}
+
 #[test]
 fn what_has_changed_against_another_trace_is_a_finding() {
     let directory = directory("against");

@@ -3,9 +3,18 @@
 use cantap_signals::SelectionError;
 use glob::Pattern;
 
-use crate::{Event, Protocol, Value, naming};
+use crate::canopen::drive::DriveState;
+use crate::{Event, EventKind, Protocol, Value, naming};
 
-/// Names of fields as in [`naming`], with `*`, `?` and `[a-z]`: `j1939.engine_speed`, `obd.*`, `xcp.enginespeed`.
+/// A node's state by its heartbeat, with [`MISSING`] while that is missing.
+const NODE_STATE: &str = "nmt_state";
+/// A drive's state (CiA 402) by its statusword, in the order of [`DriveState`].
+const DRIVE_STATE: &str = "drive_state";
+/// No heartbeat has this.
+const MISSING: f64 = -1.0;
+
+/// Names of fields as in [`naming`], with `*`, `?` and `[a-z]`: `j1939.engine_speed`, `obd.*`, `xcp.enginespeed`. States of CANopen's nodes and
+/// drives, which events have in words, are `canopen.nmt_state` and `canopen.drive_state`.
 #[derive(Clone, Debug, Default)]
 pub struct FieldSelection {
     patterns: Vec<(Protocol, Pattern, String)>,
@@ -30,6 +39,13 @@ pub struct FieldValue<'a> {
 }
 
 impl FieldSelection {
+    /// Everything.
+    pub fn all() -> Self {
+        let patterns = Protocol::ALL
+            .map(|protocol| (protocol, Pattern::new("*").unwrap_or_default(), format!("{protocol}.*")));
+        Self { matched: vec![false; patterns.len()], patterns: patterns.into() }
+    }
+
     /// Adds a name or pattern; false if it does not begin with a protocol and a dot, so that it names no field.
     pub fn add(&mut self, pattern: &str) -> Result<bool, SelectionError> {
         let Some((protocol, field)) = naming::parts_of_pattern(pattern) else { return Ok(false) };
@@ -64,8 +80,9 @@ impl FieldSelection {
         if !self.patterns.iter().any(|(protocol, ..)| *protocol == event.protocol) {
             return Vec::new();
         }
-        let mut values = Vec::new();
+        let mut values = self.states(event);
         let fields = naming::fields(event);
+        let between = format!("{} > {}", event.from, event.to);
         for (name, field) in &fields {
             let value = match field.value {
                 Value::Missing => f64::NAN,
@@ -75,21 +92,10 @@ impl FieldSelection {
                 },
             };
             let first = naming::plain(&field.name);
-            let mut is_selected = false;
-            for ((protocol, pattern, _), matched) in self.patterns.iter().zip(&mut self.matched) {
-                if *protocol == event.protocol && (pattern.matches(name) || pattern.matches(&first)) {
-                    is_selected = true;
-                    *matched |= value.is_finite();
-                }
-            }
-            if is_selected {
+            if self.selects(event.protocol, [name, &first], value.is_finite()) {
                 values.push(FieldValue {
                     name: format!("{}.{name}", event.protocol),
-                    parts: [
-                        format!("{} > {}", event.from, event.to),
-                        event.title.to_string(),
-                        which(&fields, name),
-                    ],
+                    parts: [between.clone(), event.title.to_string(), which(&fields, name)],
                     unit: &field.unit,
                     value,
                     text: field.text.as_deref(),
@@ -97,6 +103,50 @@ impl FieldSelection {
             }
         }
         values
+    }
+
+    /// Whether one of these names is selected; `is_number`: then what selects it has matched.
+    fn selects(&mut self, of: Protocol, names: [&str; 2], is_number: bool) -> bool {
+        let mut is_selected = false;
+        for ((protocol, pattern, _), matched) in self.patterns.iter().zip(&mut self.matched) {
+            if *protocol == of && names.iter().any(|name| pattern.matches(name)) {
+                is_selected = true;
+                *matched |= is_number;
+            }
+        }
+        is_selected
+    }
+
+    /// The selected states that an event has in words.
+    fn states<'a>(&mut self, event: &'a Event) -> Vec<FieldValue<'a>> {
+        if event.protocol != Protocol::CanOpen {
+            return Vec::new();
+        }
+        let drive =
+            DriveState::in_event(event).map(|state| (DRIVE_STATE, f64::from(state as u8), state.name()));
+        let states = [node_state(event), drive].into_iter().flatten();
+        let of = event.node().map_or_else(String::new, |node| node.to_string());
+        states
+            .filter(|(name, ..)| self.selects(event.protocol, [name; 2], true))
+            .map(|(name, value, text)| FieldValue {
+                name: format!("{}.{name}", event.protocol),
+                parts: [of.clone(), "state".to_owned(), String::new()],
+                unit: "",
+                value,
+                text: Some(text),
+            })
+            .collect()
+    }
+}
+
+/// The state of a node that an event is about.
+fn node_state(event: &Event) -> Option<(&'static str, f64, &str)> {
+    let state = event.data.first().map(|byte| f64::from(byte & 0x7F)).filter(|_| event.trouble.is_none());
+    match event.kind {
+        EventKind::State | EventKind::BootUp => Some((NODE_STATE, state?, &event.title)),
+        EventKind::HeartbeatBack => Some((NODE_STATE, state?, event.title.rsplit(": ").next()?)),
+        EventKind::HeartbeatMissing | EventKind::GuardMissing => Some((NODE_STATE, MISSING, &event.title)),
+        _ => None,
     }
 }
 
@@ -160,6 +210,42 @@ mod tests {
             [(0.0, "7E0#03221234"), (1.0, "7E8#0462123405"), (2.0, "7E0#03222345"), (3.0, "7E8#0462234506")];
         let (said, _) = values(&["uds.sid"], &talk);
         assert!(said[0].contains("did 0x1234") && said[1].contains("did 0x2345"), "{said:?}");
+    }
+
+    #[test]
+    fn states_of_nodes_and_drives_are_numbers_with_texts() {
+        let mut frames = vec![
+            (0.0, "705#00"),
+            (100.0, "705#7F"),
+            // Statusword is mapped to the first TPDO.
+            (110.0, "605#23001A0110004160"),
+            (111.0, "585#60001A0100000000"),
+            (112.0, "605#2F001A0001000000"),
+            (113.0, "585#60001A0000000000"),
+            (200.0, "705#05"),
+            (210.0, "185#4002"),
+            (220.0, "185#3706"),
+            (300.0, "705#05"),
+        ];
+        frames.push((2000.0, "080#"));
+        let (said, unmatched) = values(&["canopen.nmt_state", "canopen.drive_*"], &frames);
+        assert_eq!(
+            said,
+            [
+                "canopen.nmt_state 0  boot-up [5; state; ]",
+                "canopen.nmt_state 127  pre-operational [5; state; ]",
+                "canopen.nmt_state 5  operational [5; state; ]",
+                "canopen.drive_state 1  switch on disabled [5; state; ]",
+                "canopen.drive_state 4  operation enabled [5; state; ]",
+                "canopen.nmt_state -1  heartbeat missing [5; state; ]",
+            ]
+        );
+        assert_eq!(unmatched, Vec::<String>::new());
+        let mut all = FieldSelection::all();
+        let mut events = Vec::new();
+        let mut reader = Reader::new(Options { protocols: vec![Protocol::CanOpen], ..Options::default() });
+        reader.push(&at(0.0, "705#05"), &mut events);
+        assert_eq!(all.take(&events[0]).len(), 1);
     }
 
     #[test]

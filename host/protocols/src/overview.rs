@@ -14,6 +14,7 @@ use hdrhistogram::Histogram as Counts;
 use rustc_hash::FxHashMap;
 
 use self::object::{ObjectKey, number, short};
+use crate::canopen::drive::DriveState;
 use crate::{Event, EventKind, Party, Protocol, Trouble, Value};
 
 const MOST_NODES: usize = 1024;
@@ -65,6 +66,12 @@ pub struct KnownNode {
     pub faults: u64,
     /// Its state: CANopen's, or that it is missing.
     pub state: Option<String>,
+    /// Since when, in nanoseconds.
+    pub state_ns: Option<i64>,
+    /// Its state as a drive (CiA 402).
+    pub drive: Option<&'static str>,
+    /// Since when, in nanoseconds.
+    pub drive_ns: Option<i64>,
     /// The heartbeat period in milliseconds, once a heartbeat was missed.
     pub period_ms: Option<f64>,
     /// How often a heartbeat or the answer to a guarding request was missed.
@@ -194,8 +201,14 @@ impl Overview {
         node.last_ns = node.last_ns.max(event.time_ns);
         node.events += 1;
         node.faults += u64::from(event.is_fault());
+        let state_before = node.state.clone();
         if let Some(state) = crate::uavcan::state(event) {
             node.state = Some(state);
+        }
+        if let Some(drive) = DriveState::in_event(event).map(DriveState::name)
+            && node.drive.replace(drive) != Some(drive)
+        {
+            node.drive_ns = Some(event.time_ns);
         }
         if let Some(name) = crate::uavcan::node_name(event) {
             node.identity = Some(name);
@@ -217,6 +230,9 @@ impl Overview {
             }
             EventKind::AddressClaim => node.identity = Some(identity(event)),
             _ => {}
+        }
+        if node.state != state_before {
+            node.state_ns = Some(event.time_ns);
         }
         if let Some(codes) = event.field("codes").and_then(text) {
             keep(&mut node.codes, &event.title, codes);
@@ -396,6 +412,18 @@ mod tests {
         let (_, node) = plant.nodes().next().unwrap();
         assert_eq!((node.state.as_deref(), node.missed), (Some("heartbeat missing"), 1));
         assert!(node.codes["emergency"].contains("0x2310"), "{:?}", node.codes);
+        assert_eq!((node.state_ns, node.drive), (Some(450_000_000), None));
+        let drive = overview(
+            Protocol::CanOpen,
+            &[
+                (0.0, "605#4041600000000000"),
+                (1.0, "585#4B41600037060000"),
+                (9.0, "605#4041600000000000"),
+                (10.0, "585#4B41600008060000"),
+            ],
+        );
+        let (_, node) = drive.nodes().next().unwrap();
+        assert_eq!((node.drive, node.drive_ns), (Some("fault"), Some(10_000_000)));
         let truck = overview(
             Protocol::J1939,
             &[

@@ -2,42 +2,18 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use cantap_protocols::dsdl::{DataTypes, DsdlSource};
+use cantap_protocols::dsdl::{DataTypes, DsdlSource, SubjectType};
 
 use crate::report::Reporter;
 
-/// How many subjects Cyphal has.
-const SUBJECTS: u16 = 8192;
 /// How many files of definitions a folder may have.
 const MOST_FILES: usize = 20_000;
 /// How long one may be, and all of them together, in bytes.
 const MOST_BYTES: u64 = 1 << 20;
 const MOST_TOGETHER_BYTES: u64 = 64 << 20;
-
-/// A subject of Cyphal and the data type of its messages.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SubjectType {
-    subject: u16,
-    name: String,
-}
-
-impl FromStr for SubjectType {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let parts = text.split_once('=');
-        let number = parts.and_then(|(number, _)| number.parse().ok()).filter(|number| *number < SUBJECTS);
-        let (Some(subject), Some((_, name))) = (number, parts) else {
-            let example = "1620=uavcan.si.sample.voltage.Scalar.1.0";
-            return Err(format!("write it as NUMBER=TYPE, with subjects from 0 to 8191: {example}"));
-        };
-        Ok(Self { subject, name: name.to_owned() })
-    }
-}
 
 /// All definitions in a folder and the folders in it, which are the outermost namespaces, in the order of their paths. Links are not followed.
 ///

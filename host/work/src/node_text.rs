@@ -14,6 +14,9 @@ pub fn about(known: &KnownNode) -> String {
     if let Some(state) = &known.state {
         let _ = write!(about, ", {state}");
     }
+    if let Some(drive) = known.drive {
+        let _ = write!(about, ", drive: {drive}");
+    }
     if known.missed > 0 {
         let _ = write!(about, " ({} missed", counted(known.missed, "time"));
         if let Some(period_ms) = known.period_ms {

@@ -1,8 +1,9 @@
 //! What frames say together: requests and answers, messages of several frames, announcements.
 
+use std::collections::BTreeMap;
 use std::convert::Infallible;
 
-use cantap_protocols::{Event, EventKind, Options, Party, ReadItem, Reader};
+use cantap_protocols::{Event, EventKind, Options, Overview, Party, ReadItem, Reader};
 use serde::Serialize;
 
 use crate::interval::{self, IntervalAnswer};
@@ -32,11 +33,34 @@ pub struct ProtocolEvent {
     failed: bool,
 }
 
+/// `ProtocolNode` in `api.ts`.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+pub struct ProtocolNode {
+    channel: u8,
+    protocol: &'static str,
+    node: String,
+    state: Option<String>,
+    state_since: Option<f64>,
+    drive: Option<&'static str>,
+    drive_since: Option<f64>,
+    events: u64,
+    faults: u64,
+    missed: u64,
+    identity: Option<String>,
+    codes: BTreeMap<String, String>,
+    last: f64,
+}
+
 /// The answer to `conversations` in `api.ts`.
 #[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
 pub struct Found {
     events: Vec<ProtocolEvent>,
     total: usize,
+    nodes: Vec<ProtocolNode>,
+    /// Events of nodes, services and objects beyond the limits.
+    not_counted: u64,
 }
 
 /// Reads the records by their protocols, and passes on each event, those of `from_ns` and later for certain.
@@ -66,10 +90,14 @@ pub fn read(content: &Content, options: Options, from_ns: i64, to_ns: i64, mut e
     take(&batch, false);
 }
 
-/// The first events that ended in a stretch of time, and how many there are.
+/// The first events that ended in a stretch of time, how many there are, and the nodes as they are at its end.
 pub fn found(content: &Content, options: Options, from_ns: i64, to_ns: i64, limit: usize) -> Found {
-    let mut found = Found { events: Vec::new(), total: 0 };
+    let mut found = Found { events: Vec::new(), total: 0, nodes: Vec::new(), not_counted: 0 };
+    let mut overview = Overview::default();
     read(content, options, from_ns, to_ns, |event| {
+        if event.time_ns <= to_ns {
+            overview.take(event);
+        }
         if event.time_ns < from_ns || event.start_ns > to_ns {
             return;
         }
@@ -89,6 +117,24 @@ pub fn found(content: &Content, options: Options, from_ns: i64, to_ns: i64, limi
             });
         }
     });
+    let time = |time_ns: i64| content.seconds(time_ns);
+    let nodes = overview.nodes().map(|((channel, protocol, node), known)| ProtocolNode {
+        channel,
+        protocol: protocol.name(),
+        node,
+        state: known.state.as_deref().map(|state| cantap_trace::clean::line(state).into_owned()),
+        state_since: known.state_ns.map(time),
+        drive: known.drive,
+        drive_since: known.drive_ns.map(time),
+        events: known.events,
+        faults: known.faults,
+        missed: known.missed,
+        identity: known.identity.as_deref().map(|identity| cantap_trace::clean::line(identity).into_owned()),
+        codes: known.codes.clone(),
+        last: time(known.last_ns),
+    });
+    found.nodes = nodes.collect();
+    found.not_counted = overview.left_out();
     found
 }
 

@@ -11,7 +11,7 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 use serde::Serialize;
 
-use crate::descriptions::Descriptions;
+use crate::descriptions::{Connections, Descriptions};
 use crate::error::EngineError;
 use crate::index::{Index, Place};
 use crate::own_database::{OwnDatabase, ValueText};
@@ -94,6 +94,11 @@ impl Databases {
         self.sources.push(Source { channel, database });
         self.rebuild();
         Ok(loaded)
+    }
+
+    /// See [`Descriptions::connect`].
+    pub fn connect(&mut self, connections: &Connections) -> Result<(), EngineError> {
+        self.descriptions.connect(connections)
     }
 
     /// Compiles them anew; all keys of before are void.
@@ -233,6 +238,7 @@ pub struct SignalInfo {
     comment: String,
     min: Option<f64>,
     max: Option<f64>,
+    alarms: AlarmLimits,
     texts: Vec<ValueText>,
     start_bit: u16,
     bit_length: u16,
@@ -242,6 +248,13 @@ pub struct SignalInfo {
     factor: f64,
     offset: f64,
     multiplex: String,
+}
+
+/// Physical values; `None` without one.
+#[derive(Serialize)]
+struct AlarmLimits {
+    min: Option<f64>,
+    max: Option<f64>,
 }
 
 /// A signal's value for the page: `SignalValue` in `api.ts`.
@@ -262,6 +275,7 @@ fn signal_infos(message: &Message, key: usize) -> Vec<SignalInfo> {
         comment: signal.description.clone(),
         min: signal.min,
         max: signal.max,
+        alarms: AlarmLimits { min: signal.alarms.min, max: signal.alarms.max },
         texts: texts(signal),
         start_bit: signal.start,
         bit_length: signal.length,

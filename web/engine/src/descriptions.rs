@@ -1,13 +1,18 @@
 //! What explains conversations: descriptions of ECUs (A2L, ODX, CDD), sheets of CANopen nodes, data types of DroneCAN and Cyphal.
 
+use std::fmt::Display;
+use std::str::FromStr;
 use std::sync::Arc;
 
 use cantap_protocols::a2l::{A2lDescriptions, Description};
+use cantap_protocols::calibration::MasterSlave;
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
-use cantap_protocols::dsdl::{DataTypes, DsdlSource};
+use cantap_protocols::dsdl::{DataTypes, DsdlSource, SubjectType};
+use cantap_protocols::iso_tp::KnownPairs;
 use cantap_protocols::odx::{self, Odx};
 use cantap_protocols::{Options, calibration};
+use serde::Deserialize;
 
 use crate::error::EngineError;
 
@@ -21,7 +26,20 @@ pub struct Descriptions {
     odx: Vec<(String, Odx)>,
     sheets: Vec<(String, Sheet)>,
     types: Vec<DsdlSource>,
+    pairs: Vec<KnownPairs>,
+    xcp: Vec<MasterSlave>,
+    ccp: Vec<MasterSlave>,
+    subjects: Vec<SubjectType>,
     options: Options,
+}
+
+/// Who talks to whom, and about what, where a trace does not show it: as the command's options are written.
+#[derive(Deserialize)]
+pub struct Connections {
+    pairs: Vec<String>,
+    xcp: Vec<String>,
+    ccp: Vec<String>,
+    subjects: Vec<String>,
 }
 
 /// What a file is, by its name.
@@ -56,7 +74,7 @@ impl Descriptions {
     /// Adds a file; returns how many things it describes, and what of it is left out. The name of a definition of a data type is its path, from
     /// the outermost namespace on; that of a sheet may begin with a node's number and a colon.
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(usize, Vec<String>), EngineError> {
-        let refused = |error: &dyn std::fmt::Display| EngineError::Description(format!("{name}: {error}"));
+        let refused = |error: &dyn Display| EngineError::Description(format!("{name}: {error}"));
         let known = match Kind::of(name) {
             Some(Kind::A2l) => {
                 // Files that it includes are not here.
@@ -103,6 +121,32 @@ impl Descriptions {
         Ok((count, issues))
     }
 
+    /// Replaces what is known of who talks to whom. A subject's data type must be known by then.
+    pub fn connect(&mut self, connections: &Connections) -> Result<(), EngineError> {
+        let Connections { pairs, xcp, ccp, subjects } = connections;
+        (self.pairs, self.xcp, self.ccp, self.subjects) =
+            (read(pairs)?, read(xcp)?, read(ccp)?, read(subjects)?);
+        if let Err(error) = self.rebuild() {
+            self.subjects.clear();
+            self.rebuild()?;
+            return Err(error);
+        }
+        Ok(())
+    }
+
+    /// Data types, if there are any of one's own.
+    fn data_types(&self) -> Result<Option<Arc<DataTypes>>, EngineError> {
+        if self.types.is_empty() && self.subjects.is_empty() {
+            return Ok(None);
+        }
+        let mut types = DataTypes::with(&self.types).0;
+        for SubjectType { subject, name } in &self.subjects {
+            let named = types.name_subject(*subject, name);
+            named.map_err(|error| EngineError::Description(error.to_string()))?;
+        }
+        Ok(Some(Arc::new(types)))
+    }
+
     fn described(&self) -> Result<odx::Descriptions, odx::OdxError> {
         odx::Descriptions::new(self.odx.iter().map(|(_, odx)| odx::Source { odx, layer: None }))
     }
@@ -116,12 +160,17 @@ impl Descriptions {
         };
         let all: Vec<_> = self.a2l.iter().flat_map(|(_, all)| all.iter().cloned()).collect();
         let a2l = (!all.is_empty()).then(|| Arc::new(A2lDescriptions::new(all)));
+        let of_ecus = descriptions.iter().flat_map(|known| known.pairs()).map(Into::into);
         self.options = Options {
-            pairs: descriptions.iter().flat_map(|known| known.pairs()).map(Into::into).collect(),
+            pairs: self.pairs.iter().copied().chain(of_ecus).collect(),
             sheets: self.sheets.iter().map(|(_, sheet)| sheet.clone()).collect(),
             descriptions,
-            calibration: calibration::Known { descriptions: a2l, ..calibration::Known::default() },
-            types: (!self.types.is_empty()).then(|| Arc::new(DataTypes::with(&self.types).0)),
+            calibration: calibration::Known {
+                xcp: self.xcp.clone(),
+                ccp: self.ccp.clone(),
+                descriptions: a2l,
+            },
+            types: self.data_types()?,
             ..Options::default()
         };
         Ok(())
@@ -131,6 +180,12 @@ impl Descriptions {
     pub const fn options(&self) -> &Options {
         &self.options
     }
+}
+
+fn read<T: FromStr<Err: Display>>(texts: &[String]) -> Result<Vec<T>, EngineError> {
+    let one =
+        |text: &String| text.parse().map_err(|error| EngineError::Description(format!("{text}: {error}")));
+    texts.iter().map(one).collect()
 }
 
 fn replace<T>(all: &mut Vec<(String, T)>, name: &str, new: T) {

@@ -11,6 +11,7 @@ use crate::board::{self, Board};
 use crate::databases::{Databases, Loaded, SignalPlace};
 use crate::error::EngineError;
 use crate::export;
+use crate::fields::Fields;
 use crate::findings::{self, Finding};
 use crate::identifiers;
 use crate::index::{Index, Place, identifier};
@@ -48,6 +49,7 @@ pub struct Engine {
     /// By the edit's parameters.
     raw_series: Vec<(String, Series)>,
     bits: FxHashMap<u8, ChannelBits>,
+    fields: Fields,
     generation: u64,
     board: Option<Board>,
 }
@@ -120,6 +122,11 @@ impl Engine {
                 self.bitrate(channel, bitrate, data_bitrate)
             }
             Request::Database { name, bytes, channel } => self.database(&name, bytes, channel, received),
+            Request::Connections(connections) => {
+                self.databases.connect(&connections)?;
+                self.databases_changed();
+                json(json!({}))
+            }
             Request::Messages {} => {
                 self.extend_index();
                 json(self.databases.messages(&self.index))
@@ -171,6 +178,7 @@ impl Engine {
         self.views.clear();
         self.forget_signals();
         self.bits.clear();
+        self.fields = Fields::default();
     }
 
     fn forget_signals(&mut self) {
@@ -194,6 +202,8 @@ impl Engine {
             self.views.forget_first(forgotten);
             self.forget_signals();
             self.bits.clear();
+            let begin_ns = self.trace.as_ref().map_or(0, |trace| trace.content.begin_kept_ns());
+            self.fields.forget_first(forgotten, begin_ns);
         }
     }
 
@@ -278,6 +288,7 @@ impl Engine {
     fn databases_changed(&mut self) {
         self.views.clear();
         self.forget_signals();
+        self.fields = Fields::default();
     }
 
     fn edit(&mut self, request: Request) -> Answer {
@@ -299,7 +310,7 @@ impl Engine {
     fn of_trace(&mut self, request: Request, sections: &mut Sections) -> Answer {
         self.content()?;
         self.extend_index();
-        let Self { trace, databases, views, index, .. } = self;
+        let Self { trace, databases, views, index, fields, .. } = self;
         let trace = trace.as_ref().ok_or(EngineError::NoTrace)?;
         let content = &trace.content;
         let store = &content.store;
@@ -366,6 +377,14 @@ impl Engine {
             Request::Conversations { from, to, limit } => {
                 let (from, to) = window(from, to);
                 json(conversations::found(content, databases.conversations(), from, to, limit.min(MOST_ROWS)))
+            }
+            Request::Fields { records } => {
+                fields.read(store, !trace.progress().growing, records, || databases.conversations());
+                json(fields.answer())
+            }
+            Request::FieldSeries { field, from, to, columns } => {
+                let (from, to) = window(from, to);
+                picture(&fields.picture(field, from, to, columns.min(MOST_COLUMNS))?, content, sections)
             }
             Request::Findings {} => json(findings::all(content, index, &*databases)),
             Request::Export { view, format, from, to } => {

@@ -33,6 +33,12 @@ pub enum EngineError {
     /// The trace's format is not recognised.
     #[error("{0}; give the file a name that shows its format, such as .log, .asc, .blf or .trc")]
     Format(String),
+    /// A file of a format that is read at many places, and more than fits into the page.
+    #[error(
+        "a file of this format must fit into the page as a whole, and this one is too large; \
+         convert it to BLF, or a part of it, with cantap convert"
+    )]
+    TooLarge,
     /// The trace could not be opened.
     #[error(transparent)]
     Open(OpenError),

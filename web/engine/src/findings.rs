@@ -4,11 +4,12 @@ use std::collections::BTreeSet;
 
 use cantap_analysis::stats::{Statistics, WorkLoad};
 use cantap_protocols::{EventKind, Party};
-use cantap_signals::Decoder;
+use cantap_signals::{Decoder, Number};
 use cantap_trace::counted;
 use cantap_trace::{Id, Seconds, TraceEvent};
 use serde::Serialize;
 
+use crate::alarms::{self, Beyond};
 use crate::conversations;
 use crate::databases::Databases;
 use crate::gaps::BUS_OFF;
@@ -90,6 +91,7 @@ pub fn all(content: &Content, index: &Index, databases: &Databases) -> Vec<Findi
     unread(content, &mut found);
     channels(content, &mut found);
     missing_periods(content, index, databases.decoder(), &mut found);
+    alarms(content, index, databases.decoder(), &mut found);
     trouble_codes(content, databases, &mut found);
     found.sort_by_key(|finding: &Finding| finding.severity);
     found
@@ -251,6 +253,26 @@ fn missing_periods(content: &Content, index: &Index, decoder: &Decoder, found: &
             Severity::Warning,
             format!("{more} did not come for some time", more = counted(more, "more identifier")),
         ));
+    }
+}
+
+/// Signals that were beyond the limits of their alarms.
+fn alarms(content: &Content, index: &Index, decoder: &Decoder, found: &mut Vec<Finding>) {
+    let all = alarms::beyond(&content.store, index, decoder);
+    found.extend(all.iter().take(MOST_OF_A_KIND).map(|beyond| {
+        let Beyond { place, name, unit, is_above, limit, values, farthest, first_ns } = beyond;
+        let (where_, most) = if *is_above { ("above", "largest") } else { ("below", "smallest") };
+        let unit = if unit.is_empty() { String::new() } else { format!(" {unit}") };
+        let values = counted(*values, "value");
+        let text = format!(
+            "{name}: {values} {where_} {limit}{unit}, the {most} {}{unit}",
+            Number::Real(*farthest).for_people()
+        );
+        Finding::new(Severity::Warning, text).on(place.channel).of(place.id).at(content.seconds(*first_ns))
+    }));
+    if let Some(more) = all.len().checked_sub(MOST_OF_A_KIND).filter(|more| *more > 0) {
+        let text = format!("{} beyond their alarms", counted(more, "more signal"));
+        found.push(Finding::new(Severity::Warning, text));
     }
 }
 

@@ -11,6 +11,7 @@
 
 #[cfg(target_family = "wasm")]
 pub mod abi;
+mod alarms;
 mod board;
 mod conversations;
 mod databases;
@@ -20,6 +21,7 @@ mod device_times;
 mod engine;
 mod error;
 mod export;
+mod fields;
 mod findings;
 mod gaps;
 mod identifiers;

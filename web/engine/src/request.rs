@@ -4,6 +4,7 @@ use cantap_wire::CHANNELS;
 use serde::Deserialize;
 
 use crate::board::Piece;
+use crate::descriptions::Connections;
 use crate::message::Bytes;
 use crate::own_database::SignalEdit;
 
@@ -16,6 +17,7 @@ pub enum Request {
     Summary {},
     Bitrate { channel: u8, bitrate: u32, data_bitrate: Option<u32> },
     Database { name: String, bytes: Bytes, channel: Option<u8> },
+    Connections(Connections),
     Messages {},
     Filter { filter: String },
     Rows { view: u32, from: usize, count: usize },
@@ -31,6 +33,8 @@ pub enum Request {
     Interval { from: f64, to: f64 },
     Periods { channel: u8, id: u32, extended: bool },
     Conversations { from: Option<f64>, to: Option<f64>, limit: usize },
+    Fields { records: usize },
+    FieldSeries { field: usize, from: Option<f64>, to: Option<f64>, columns: usize },
     Findings {},
     EditSignal(Box<SignalEdit>),
     SetOwnDatabase { dbc: String },

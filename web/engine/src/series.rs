@@ -36,18 +36,21 @@ pub struct Block {
 }
 
 impl Block {
-    const fn of(time_ns: i64, value: f64) -> Self {
+    /// A single value.
+    pub const fn of(time_ns: i64, value: f64) -> Self {
         Self { from_ns: time_ns, to_ns: time_ns, first: value, min: value, max: value, last: value }
     }
 
-    fn add(&mut self, later: &Self) {
+    /// Adds what follows.
+    pub fn add(&mut self, later: &Self) {
         self.to_ns = later.to_ns;
         self.min = self.min.min(later.min);
         self.max = self.max.max(later.max);
         self.last = later.last;
     }
 
-    fn is_one(&self) -> bool {
+    /// Whether it is a single value.
+    pub fn is_one(&self) -> bool {
         self.from_ns == self.to_ns && self.min.total_cmp(&self.max).is_eq()
     }
 }
@@ -242,6 +245,26 @@ impl Series {
         found
     }
 
+    /// Calls `each` with the times and values for which `is_beyond` is true. It must be true from some value on, upwards or downwards: a block
+    /// whose extremes are not is not decoded.
+    pub fn values_beyond(
+        &self,
+        store: &Store,
+        rows: &[u32],
+        is_beyond: impl Fn(f64) -> bool,
+        mut each: impl FnMut(i64, f64),
+    ) {
+        for (number, block) in self.levels[0].iter().enumerate() {
+            if is_beyond(block.min) || is_beyond(block.max) {
+                self.decode_blocks(store, &rows[..self.scanned], number, number + 1, |time_ns, value| {
+                    if is_beyond(value) {
+                        each(time_ns, value);
+                    }
+                });
+            }
+        }
+    }
+
     /// Decodes the values of some blocks of the lowest level.
     fn decode_blocks(
         &self,
@@ -285,7 +308,7 @@ fn sum(blocks: &[Block]) -> Block {
 }
 
 /// Joins neighbours until there are no more than `columns`, in equal stretches of time.
-fn merge(parts: &[Block], columns: usize) -> Vec<Block> {
+pub fn merge(parts: &[Block], columns: usize) -> Vec<Block> {
     let (Some(first), Some(last)) = (parts.first(), parts.last()) else { return Vec::new() };
     if parts.len() <= columns {
         return parts.to_vec();

@@ -13,6 +13,10 @@ use crate::store::{BLOCK_ROWS, Store};
 const RESERVE: u64 = 512 * 1024;
 /// Above this many bytes, those that have been read are freed at once.
 const KEPT: u64 = 512 * 1024 * 1024;
+/// A file that must be there as a whole may have so many bytes: it is there twice, and the reader's copy grows by doubling.
+const MOST_WHOLE: u64 = 768 * 1024 * 1024;
+/// A format whose reader still runs dry after so many bytes is one that is read at many places.
+const TRIED: u64 = 64 * 1024 * 1024;
 /// More records than this do not fit in the 4 GiB that WebAssembly has, with what is computed from them.
 const MOST_RECORDS: usize = 100_000_000;
 /// A live trace keeps this many of its newest records unless it is told otherwise: 9 minutes of two saturated buses in about 240 MB.
@@ -291,10 +295,10 @@ impl Trace {
                 // What it found may be wrong, such as a file that seems to be cut.
                 *reader = None;
                 *reserve = pieces.received() * 2;
-                if !pieces.rewind() {
-                    let text = "this file cannot be read in pieces, and is too large to be kept whole; \
-                                convert it with cantap convert first";
-                    return Err(EngineError::Format(format!("{}: {text}", self.name)));
+                let is_too_large =
+                    self.size.is_some_and(|size| size > MOST_WHOLE) && pieces.received() >= TRIED;
+                if is_too_large || !pieces.rewind() {
+                    return Err(EngineError::TooLarge);
                 }
                 self.content = Content::new(&self.rates);
                 self.generation += 1;

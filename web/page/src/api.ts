@@ -128,6 +128,8 @@ export interface SignalInfo {
   /** Limits as the database has them; null if it gives none. */
   min: number | null;
   max: number | null;
+  /** Below and above which a signal file sets an alarm. */
+  alarms: { min: number | null; max: number | null };
   /** Texts of values, if it has any: then a digital lane serves better than a line. */
   texts: { value: number; text: string }[];
   startBit: number;
@@ -194,6 +196,14 @@ export interface Finding {
   extended: boolean;
 }
 
+/** As the options of `cantap conversations` are written: `7E0:7E8` or a maker, `7F0:7F1`, `1620=uavcan.si.sample.voltage.Scalar.1.0`. */
+export interface Connections {
+  pairs: string[];
+  xcp: string[];
+  ccp: string[];
+  subjects: string[];
+}
+
 /** A conversation's event: a request, an answer, an announcement. */
 export interface ProtocolEvent {
   time: number;
@@ -206,6 +216,47 @@ export interface ProtocolEvent {
   to: string;
   text: string;
   failed: boolean;
+}
+
+/** A node of a bus as its protocol shows it, at the end of the stretch that was asked for. Times are those of the change, null if there is none. */
+export interface ProtocolNode {
+  channel: number;
+  protocol: string;
+  /** Its number, or its identifier. */
+  node: string;
+  /** In words: that of a CANopen node, or that its heartbeat is missing. */
+  state: string | null;
+  stateSince: number | null;
+  /** Its state as a drive (CiA 402), in words. */
+  drive: string | null;
+  driveSince: number | null;
+  events: number;
+  faults: number;
+  /** Heartbeats and answers to guarding that did not come. */
+  missed: number;
+  identity: string | null;
+  /** Trouble codes, by the list they are in. */
+  codes: Record<string, string>;
+  last: number;
+}
+
+/** A number that a protocol has in its messages. */
+export interface FieldInfo {
+  /** Key to name it in other requests: stable until the trace or a database changes. */
+  key: number;
+  channel: number;
+  /** The protocol, a dot, and the field, as conditions have it: `j1939.engine_speed`. */
+  name: string;
+  /** Who says it to whom. */
+  between: string;
+  message: string;
+  /** Which of several things of the same name it is about; mostly empty. */
+  which: string;
+  unit: string;
+  /** Values that were read so far. */
+  count: number;
+  /** What each value stands for; empty if it is a quantity. */
+  texts: { value: number; text: string }[];
 }
 
 /** A DBC's signal as the user draws it; see `editSignal`. */
@@ -275,6 +326,8 @@ export interface Requests {
    * PDX, CDD, EDS, DSDL, by name).
    */
   database: { in: { name: string; bytes: Uint8Array; channel: number | null }; out: { messages: number; signals: number; warnings: string[] } };
+  /** Replaces what is known of who talks to whom where a trace does not show it. After the databases that name its data types. */
+  connections: { in: Connections; out: Record<string, never> };
   /** All messages: those of databases, and whether they occur. */
   messages: { in: Record<string, never>; out: MessageInfo[] };
   /**
@@ -312,7 +365,15 @@ export interface Requests {
     in: { channel: number; id: number; extended: boolean };
     out: { edges: Float64Array; counts: Uint32Array; min: number; max: number; mean: number; deviation: number; byDevice: boolean };
   };
-  conversations: { in: { from: number; to: number; limit: number }; out: { events: ProtocolEvent[]; total: number } };
+  /** `notCounted`: events of nodes, services and objects beyond those that are kept. */
+  conversations: { in: { from: number; to: number; limit: number }; out: { events: ProtocolEvent[]; total: number; nodes: ProtocolNode[]; notCounted: number } };
+  /**
+   * Reads the next `records` records for numbers that protocols have in their messages, and lists what was found so far in the first `read`
+   * records. `leftOut`: values beyond those that are kept.
+   */
+  fields: { in: { records: number }; out: { fields: FieldInfo[]; read: number; leftOut: number } };
+  /** As `series`. */
+  fieldSeries: { in: { field: number; from: number; to: number; columns: number }; out: Series };
   findings: { in: Record<string, never>; out: Finding[] };
   /** Adds or changes a signal of the user's own database; undo and redo are the page's, by the whole text. */
   editSignal: { in: SignalEdit; out: { dbc: string } };

@@ -58,7 +58,7 @@ export async function start(loadEngine: () => Promise<Engine>): Promise<void> {
 
 async function openReport(app: App, report: Report): Promise<boolean> {
   try {
-    await addCarried(app, report.databases);
+    await addCarried(app, report);
     await app.openTrace(await unpack(report.trace), report.bitrates);
     return true;
   } catch (error) {

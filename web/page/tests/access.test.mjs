@@ -28,6 +28,12 @@ for (const theme of ['dark', 'light']) {
         if (view === 'graphs') {
           await page.locator('#view-graphs .tree-signal').nth(1).click();
           await page.locator('.panel').first().waitFor();
+          await page.locator('.tree-look').click();
+          await until(page, 'what protocols name is listed', () => document.querySelector('.tree').textContent.includes('engine_speed'));
+        }
+        if (view === 'conversations') {
+          found.push(...(await violations(page)).map((v) => `ladder: ${v}`));
+          await page.getByLabel('Shape').selectOption('nodes');
         }
         if (view === 'bits') await page.locator('.bit').first().waitFor();
         if (view === 'trace') {

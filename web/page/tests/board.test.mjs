@@ -7,7 +7,7 @@ import { tmpdir } from 'node:os';
 import { join, resolve } from 'node:path';
 import { after, test } from 'node:test';
 import { newPage, quit, saved, show, until, untilText } from './browser.mjs';
-import { Line, scriptedBoard, sealed, virtualBoard } from './fake-serial.mjs';
+import { Line, emulatedBoard, emulator, scriptedBoard, sealed, virtualBoard } from './fake-serial.mjs';
 
 after(quit);
 
@@ -91,6 +91,21 @@ test('a board is opened to listen, shown live, closed and saved: every frame tha
     assert.equal(await frames(page), sum);
     assert.equal((await lines(page)).length, sum);
     assert.equal(await page.evaluate(() => window.serialLog.closed), 1);
+    await page.done();
+  } finally {
+    await board.stop();
+  }
+});
+
+test('the emulated board, with the firmware as it is flashed: every frame that it has counted', { skip: emulator() ? false : 'there is no emulator with firmware: cargo xtask firmware' }, async () => {
+  const board = await emulatedBoard(emulator(), 20);
+  const page = await opened(new Line(board), ['500k', '500k']);
+  try {
+    await untilText(page, '#view-board', 'Open, and only listening');
+    await untilMore(page, 300);
+    const counts = await closed(page);
+    for (const { received, lost, counted } of counts) assert.deepEqual([received > 100, received, lost], [true, counted, 0]);
+    assert.equal((await lines(page)).length, counts[0].received + counts[1].received);
     await page.done();
   } finally {
     await board.stop();

@@ -1,6 +1,7 @@
 // The page as it is delivered, over its own engine: each view's figures against those of a trace that is computed here.
 
 import assert from 'node:assert/strict';
+import { spawnSync } from 'node:child_process';
 import { join } from 'node:path';
 import { after, test } from 'node:test';
 import { HERE, newPage, quit, saved, show, until, untilRow, untilText } from './browser.mjs';
@@ -119,7 +120,7 @@ test('fixed view and periods give the identifier’s period', async () => {
   await page.done();
 });
 
-test('bits: changes are counted, a signal is made of them, and its DBC is read again', async () => {
+test('bits: changes are counted, a signal is made of them, and its DBC is read again, by cantools too', async (t) => {
   const page = await opened('bits');
   await untilText(page, '#view-bits .state', '4 000 frames');
   assert.match(await page.locator('#bit-23').getAttribute('aria-label'), /byte 2 bit 0: 3.999 changes/);
@@ -136,6 +137,10 @@ test('bits: changes are counted, a signal is made of them, and its DBC is read a
   await until(page, 'the signal is there', () => [...document.querySelectorAll('.bit-legend button')].some((b) => b.textContent.startsWith('Counter ')));
   const dbc = await saved(page, () => page.getByRole('button', { name: 'Save DBC' }).click());
   assert.match(dbc.bytes.toString(), /BO_ 256 \w+: 8 [\s\S]*SG_ Counter : 40\|8@1\+ \(1,0\)/);
+  const program = "import cantools, sys; print([(s.name, s.start, s.length) for s in cantools.database.load_string(sys.stdin.read(), 'dbc').get_message_by_frame_id(256).signals])";
+  const cantools = spawnSync(process.env.CANTAP_PYTHON ?? 'python3', ['-c', program], { input: dbc.bytes, encoding: 'utf8' });
+  if (cantools.error || cantools.stderr.includes("No module named 'cantools'")) t.diagnostic('cantools is not there: only our own reader has read the DBC');
+  else assert.ok(cantools.stdout.includes("('Counter', 40, 8)"), cantools.stderr + cantools.stdout);
   await page.done();
 });
 
@@ -156,6 +161,24 @@ test('conversations: who is not known is not drawn as somebody who is', async ()
     const row = [...document.querySelectorAll('#view-conversations .list:not([hidden]) .list-row:not([hidden])')].find((r) => r.textContent.includes('SDO write 1017:00'));
     return row.querySelector('svg').getAttribute('aria-label') === 'unknown to 5' && row.querySelector('line.arrow.unknown').getAttribute('x1') === '1';
   });
+  await page.done();
+});
+
+test('without a database: CANopen nodes have their states, and what protocols name is drawn', async () => {
+  const page = await newPage({ file: PAGE });
+  await page.locator('main.start input[type=file]').setInputFiles([join(HERE, '../../../host/protocols/tests/buses/machine.log')]);
+  await page.locator('.shell[data-growing=false]').waitFor();
+  await show(page, 'conversations');
+  await page.getByLabel('Shape').selectOption('nodes');
+  await untilText(page, '#view-conversations .list:not([hidden]) .list-layer', 'canopen');
+  const nodes = await page.locator('#view-conversations .list:not([hidden]) .list-layer .list-row:not([hidden])').evaluateAll((rows) => rows.map((row) => [...row.children].map((cell) => cell.textContent)));
+  assert.deepEqual(nodes.map((cells) => [1, 2, 3, 5].map((i) => cells[i])), [['canopen', '5', 'boot-up', 'operation enabled'], ['canopen', '6', 'operational', '']]);
+  await show(page, 'graphs');
+  await page.locator('.tree-look').click();
+  await untilText(page, '.fields-state', 'of protocols');
+  const state = page.locator('#view-graphs .tree-signal', { hasText: 'nmt_state' }).first();
+  await state.click();
+  await until(page, 'its states are a lane', () => document.querySelector('.panel')?.classList.contains('digital') && document.querySelector('#view-graphs').dataset.busy === 'false');
   await page.done();
 });
 

@@ -18,6 +18,7 @@ const signal = (key: number, name: string, unit: string, startBit: number, bitLe
   comment: '',
   min: null,
   max: null,
+  alarms: { min: null, max: null },
   texts: [],
   startBit,
   bitLength,
@@ -31,7 +32,7 @@ const signal = (key: number, name: string, unit: string, startBit: number, bitLe
 });
 
 const MESSAGES: MessageInfo[] = [
-  { key: 1, name: 'Engine', channel: 1, id: 0x100, extended: false, length: 8, count: 0, comment: 'From the engine', signals: [signal(11, 'Speed', 'rpm', 0, 16), signal(12, 'Temperature', '°C', 23, 8, { littleEndian: false, offset: -40 }), signal(13, 'Low', '', 0, 8)] },
+  { key: 1, name: 'Engine', channel: 1, id: 0x100, extended: false, length: 8, count: 0, comment: 'From the engine', signals: [signal(11, 'Speed', 'rpm', 0, 16, { alarms: { min: 1000, max: 5000 } }), signal(12, 'Temperature', '°C', 23, 8, { littleEndian: false, offset: -40 }), signal(13, 'Low', '', 0, 8)] },
   { key: 2, name: 'Gearbox', channel: 1, id: 0x123, extended: false, length: 8, count: 0, comment: '', signals: [signal(21, 'Gear', '', 0, 4, { texts: [{ value: 0, text: 'Neutral' }, { value: 1, text: 'First' }, { value: 2, text: 'Second' }, { value: 3, text: 'Third' }] })] },
   { key: 3, name: '</script><img src=x onerror=alert(1)>', channel: null, id: 0x300, extended: false, length: 8, count: 0, comment: '', signals: [] },
 ];
@@ -52,6 +53,7 @@ export class FakeEngine implements Engine {
   #own = '';
   #bitrate: number | null = 500_000;
   #died = false;
+  #fieldsRead = 0;
   /** Requests so far, by name. */
   readonly asked = new Map<string, number>();
 
@@ -168,6 +170,7 @@ export class FakeEngine implements Engine {
     summary: () => this.#summary(),
     bitrate: ({ bitrate }) => ((this.#bitrate = bitrate), this.#summary()),
     database: () => ({ messages: 2, signals: 4, warnings: [] }),
+    connections: () => ({}),
     messages: () => this.#messages(),
     filter: ({ filter }) => {
       if (filter !== '' && !/^[0-9A-F]+$/i.test(filter)) throw new Error(`“${filter}” is no filter: write identifiers such as 123.`);
@@ -218,7 +221,25 @@ export class FakeEngine implements Engine {
     conversations: () => ({
       events: Array.from({ length: 300 }, (_, i) => ({ time: i * 0.05, end: i * 0.05 + 0.012, took: this.#interval(0, 0.012), channel: 1, protocol: i % 3 ? 'UDS' : 'J1939', kind: i % 2 ? 'answer' : 'request', from: i % 2 ? 'ECU 7E8' : 'tester', to: i % 3 ? (i % 2 ? 'tester' : 'ECU 7E8') : '', text: `ReadDataByIdentifier F190, part ${i}`, failed: i % 17 === 0 })),
       total: 300,
+      nodes: [
+        { channel: 1, protocol: 'canopen', node: '5', state: 'operational', stateSince: 2.5, drive: 'fault', driveSince: 4.999, events: 40, faults: 1, missed: 2, identity: null, codes: { emergency: '0x2310 continuous overcurrent' }, last: 9 },
+        { channel: 1, protocol: 'j1939', node: '0', state: null, stateSince: null, drive: null, driveSince: null, events: 260, faults: 0, missed: 0, identity: 'engine, manufacturer <b>1</b>', codes: {}, last: 9.5 },
+      ],
+      notCounted: 0,
     }),
+    fields: ({ records }) => {
+      this.#fieldsRead = Math.min(this.#records, this.#fieldsRead + records);
+      const field = { channel: 1, between: '0 > all', message: 'EEC1 engine', which: '', count: this.#fieldsRead / 4 };
+      return {
+        fields: [
+          { ...field, key: 0, name: 'j1939.engine_speed', unit: 'rpm', texts: [] },
+          { ...field, key: 1, name: 'canopen.nmt_state', between: '5', message: 'state', unit: '', texts: [{ value: 0, text: 'boot-up' }, { value: 1, text: 'stopped' }, { value: 2, text: 'operational' }, { value: 3, text: 'pre-operational' }] },
+        ],
+        read: this.#fieldsRead,
+        leftOut: 0,
+      };
+    },
+    fieldSeries: ({ field, from, to, columns }) => this.#series(field === 0 ? 11 : 21, from, to, columns),
     findings: () => [
       { severity: 'error', text: 'At least 7 frames were lost in the device queue.', time: 4.999, channel: 1, id: null, extended: false },
       { severity: 'warning', text: 'The period of 100 was missed once, 6.1 ms instead of 4 ms.', time: 2.5, channel: 1, id: 0x100, extended: false },

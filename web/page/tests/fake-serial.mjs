@@ -1,8 +1,8 @@
 // A stand-in for `navigator.serial`: its ports carry bytes to and from the test, which has a virtual board's terminal at the other end, or lies.
 
 import { spawn } from 'node:child_process';
-import { closeSync, openSync, write } from 'node:fs';
-import { resolve } from 'node:path';
+import { closeSync, existsSync, openSync, write } from 'node:fs';
+import { dirname, join, resolve } from 'node:path';
 import { createInterface } from 'node:readline';
 import { ReadStream } from 'node:tty';
 import { newPage } from './browser.mjs';
@@ -120,11 +120,28 @@ export class Line {
 }
 
 /** `cantap virtual`: the firmware's library behind a terminal. */
-export async function virtualBoard(options) {
-  const child = spawn(resolve(process.env.CANTAP_TEST_PROGRAM), ['virtual', options], { stdio: ['ignore', 'pipe', 'ignore'] });
+export function virtualBoard(options) {
+  return behindTerminal(process.env.CANTAP_TEST_PROGRAM, ['virtual', options]);
+}
+
+/** Where the emulator and the firmware are after `cargo xtask firmware`; null without them. */
+export function emulator() {
+  const folder = dirname(resolve(process.env.CANTAP_TEST_PROGRAM ?? ''));
+  const found = { program: join(folder, 'cantap-sim'), firmware: join(folder, '../firmware/cantap-olimex-p405.elf') };
+  return existsSync(found.program) && existsSync(found.firmware) ? found : null;
+}
+
+/** The emulated board behind a terminal, both buses with this load in per cent. */
+export function emulatedBoard({ program, firmware }, load) {
+  return behindTerminal(program, ['run', firmware, '--pty', '--load', String(load)]);
+}
+
+/** A board that a program serves on a terminal, whose name is its first line. */
+async function behindTerminal(program, args) {
+  const child = spawn(resolve(program), args, { stdio: ['ignore', 'pipe', 'ignore'] });
   const ended = new Promise((done) => child.on('close', done));
   const path = await Promise.race([new Promise((found) => createInterface({ input: child.stdout }).once('line', found)), ended]);
-  if (typeof path !== 'string') throw new Error('cantap virtual has ended');
+  if (typeof path !== 'string') throw new Error(`${program} ${args.join(' ')} has ended`);
   let output = null;
   let input = null;
   return {

@@ -1,6 +1,6 @@
 import assert from 'node:assert/strict';
 import { after, test } from 'node:test';
-import { opened, quit, saved, until, untilText } from './browser.mjs';
+import { openTrace, opened, quit, saved, show, until, untilText } from './browser.mjs';
 
 after(quit);
 
@@ -139,6 +139,14 @@ test('what is saved is well-formed: PNG by its signature, SVG by a parser, CSV b
   await page.done();
 });
 
+test('what is above and below the limits of an alarm is shaded', async () => {
+  const page = await withGraphs('Speed');
+  const shades = await page.evaluate(() => ['--alarm-above', '--alarm-below'].map((name) => getComputedStyle(document.querySelector('#view-graphs')).getPropertyValue(name).trim()));
+  const svg = (await saved(page, () => page.getByRole('button', { name: 'SVG' }).click())).bytes.toString();
+  for (const shade of shades) assert.ok(svg.includes(`fill="${shade}"`), `${shade} in ${svg.slice(0, 400)}`);
+  await page.done();
+});
+
 test('signals of different units in one graph have a scale each', async () => {
   const page = await withGraphs('Speed', 'Temperature');
   await page.getByRole('button', { name: /^Join Engine.Temperature/ }).click();
@@ -150,6 +158,31 @@ test('signals of different units in one graph have a scale each', async () => {
   });
   assert.equal(spread.length, 2);
   assert.ok(Math.abs(spread[0] - spread[1]) < 1, `both fill the height: ${spread}`);
+  await page.done();
+});
+
+test('numbers that protocols name are looked for when asked, drawn as lines or lanes, and kept in the profile', async () => {
+  const page = await opened('graphs');
+  const row = (name) => page.locator('.tree [role=treeitem]', { hasText: name }).first();
+  assert.equal(await page.locator('.fields-state').isVisible(), false);
+  await row('Numbers that protocols name').click();
+  await untilText(page, '.fields-state', '2 numbers of protocols');
+  await row('engine_speed').click();
+  await row('nmt_state').click();
+  await until(page, 'two graphs are there', () => document.querySelectorAll('.panel').length === 2);
+  await untilText(page, '.panel:first-child .legend-name', '0 > all EEC1 engine: engine_speed');
+  await until(page, 'a state is a lane', () => document.querySelectorAll('.panel')[1].classList.contains('digital'));
+  await page.locator('#view-graphs .graph-stack').focus();
+  await page.keyboard.press('a');
+  await untilText(page, '.panel:nth-child(2) .legend', 'A pre-operational');
+  const kept = await page.evaluate(() => JSON.parse(localStorage.getItem('cantap.profile')).panels.map((panel) => panel.items[0]));
+  assert.deepEqual(kept[0], { kind: 'field', channel: 1, name: 'j1939.engine_speed', between: '0 > all', message: 'EEC1 engine', which: '' });
+  // Whoever comes back sees them again, without asking.
+  await page.reload();
+  await openTrace(page);
+  await show(page, 'graphs');
+  await untilText(page, '.fields-state', '2 numbers of protocols');
+  await until(page, 'they are drawn', () => document.querySelectorAll('.panel').length === 2 && !document.querySelector('.panels').textContent.includes('no message has it'));
   await page.done();
 });
 

@@ -58,6 +58,21 @@ test('the trace grows and is followed; paused, it stands still while records sti
     await untilText(page, 'footer', 'no known loss');
   }));
 
+test('the trace is filtered and searched while frames arrive, letter by letter', () =>
+  live(['-d', 'virtual:car'], 'trace', async (page) => {
+    await untilText(page, '.live-state', 'live');
+    await untilMore(page);
+    await page.locator('#trace-find').pressSequentially('dlc == 8');
+    await until(page, 'a row was found', () => document.querySelector('#view-trace .list-row.selected:not([hidden]):not(.pending)') !== null);
+    assert.match(await page.locator('#view-trace .list-row.selected').textContent(), /( [0-9A-F]{2}){7}/);
+    await untilMore(page);
+    await page.locator('#trace-filter').pressSequentially('ch == 1');
+    await until(page, 'filtered', () => / of .* records/.test(document.querySelector('#view-trace .state').textContent));
+    const state = await page.locator('#view-trace .state').textContent();
+    await until(page, 'and more of them', (s) => document.querySelector('#view-trace .state').textContent !== s, state);
+    await untilText(page, 'footer', 'no known loss');
+  }));
+
 test('all views show what arrives', () =>
   live(['-d', 'virtual:car'], 'fixed', async (page) => {
     await until(page, 'identifiers have periods', () => [...document.querySelectorAll('#view-fixed .list-layer .list-row:not([hidden]) .c-period')].some((cell) => /\d\.\d{3}$/.test(cell.textContent)));

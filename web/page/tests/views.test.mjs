@@ -72,6 +72,22 @@ test('conversations: ladder and list, searched, lead to the trace', async () => 
   await page.done();
 });
 
+test('conversations: nodes have their states as states, searched, lead to their last change', async () => {
+  const page = await opened('conversations');
+  await page.getByLabel('Shape').selectOption('nodes');
+  await untilText(page, '#view-conversations .state', '2 of 2 nodes, as they are at the end');
+  const texts = (await page.locator('#view-conversations .list:not([hidden]) .list-layer .list-row:not([hidden]) > *').allTextContents());
+  assert.deepEqual(texts, ['1', 'canopen', '5', 'operational', '2.500000', 'fault', '4.999000', '2', '1', 'emergency: 0x2310 continuous overcurrent', '1', 'j1939', '0', '', '', '', '', '0', '0', 'engine, manufacturer <b>1</b>']);
+  await page.keyboard.press('/');
+  await page.keyboard.type('fault');
+  await untilText(page, '#view-conversations .state', '1 of 2 nodes');
+  await page.locator('#view-conversations .list:not([hidden])').focus();
+  await page.keyboard.press('Home');
+  await page.keyboard.press('Enter');
+  await untilRow(page, 4999);
+  await page.done();
+});
+
 test('notes are made at a cursor, lead there, and are saved', async () => {
   const page = await opened('trace');
   await page.locator('#view-trace .list').focus();

@@ -20,7 +20,7 @@ use super::doors::{Allowed, Door, address, allow};
 use super::way::Way;
 use crate::commands::ui::DEAD_MAN;
 use crate::database_args::{DatabaseArgs, load};
-use crate::page;
+use crate::page::{self, Described};
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -93,7 +93,7 @@ impl WebDoor {
         }
         let options = databases.or_of(boards.addresses());
         let decoder = load(&options, false, false)?;
-        let about = page::about_devices(boards.addresses(), &options, Vec::new(), "cantap serve")?;
+        let about = page::about_devices(boards.addresses(), &options, Described::default(), "cantap serve")?;
         let site = Site::new(&page::with(&page::find()?, page::LIVE, &about)?)?;
         Ok(Self {
             address,

@@ -5,7 +5,7 @@
 use super::eds::Eds;
 use super::names;
 use super::types::number_of;
-use crate::{Field, Value};
+use crate::{Event, Field, Value};
 
 /// Device types with this number in their low half are drives (object 1000).
 const PROFILE: u32 = 402;
@@ -73,6 +73,17 @@ impl DriveState {
     /// Its name.
     pub fn name(self) -> &'static str {
         names::drive_state(self as u8)
+    }
+
+    /// The state that an event says: that of a statusword that was sent or read, whatever a sheet calls it.
+    pub fn in_event(event: &Event) -> Option<Self> {
+        event.fields.iter().find_map(|field| match field.value {
+            Value::Hex(word, 4) => {
+                let state = Self::of(u16::try_from(word).ok()?)?;
+                (field.text.as_deref() == Some(state.name())).then_some(state)
+            }
+            _ => None,
+        })
     }
 
     /// Whether the motor may have power.

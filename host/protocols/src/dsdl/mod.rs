@@ -22,4 +22,4 @@ pub use condensed::condensed;
 pub(crate) use model::{Definition, Generation, Section};
 pub use parse::DsdlSource;
 pub(crate) use read::{Unread, read};
-pub use types::{DataTypes, UnknownType};
+pub use types::{BadSubjectType, DataTypes, SubjectType, UnknownType};

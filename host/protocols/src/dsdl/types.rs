@@ -1,5 +1,7 @@
 //! The data types that are built in, and a user's own.
 
+use std::fmt;
+use std::str::FromStr;
 use std::sync::{Arc, OnceLock};
 
 use super::condensed;
@@ -22,6 +24,39 @@ pub struct DataTypes {
 pub struct UnknownType {
     /// The given name.
     pub name: String,
+}
+
+/// How many subjects Cyphal has.
+const SUBJECTS: u16 = 8192;
+
+/// A subject of Cyphal and the data type of its messages, as a text such as `1620=uavcan.si.sample.voltage.Scalar.1.0`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SubjectType {
+    /// The subject's number, from 0 to 8191.
+    pub subject: u16,
+    /// The data type's name.
+    pub name: String,
+}
+
+/// A text that is no [`SubjectType`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("write it as NUMBER=TYPE, with subjects from 0 to 8191: 1620=uavcan.si.sample.voltage.Scalar.1.0")]
+pub struct BadSubjectType;
+
+impl FromStr for SubjectType {
+    type Err = BadSubjectType;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let (number, name) = text.split_once('=').ok_or(BadSubjectType)?;
+        let subject = number.parse().ok().filter(|number| *number < SUBJECTS).ok_or(BadSubjectType)?;
+        Ok(Self { subject, name: name.to_owned() })
+    }
+}
+
+impl fmt::Display for SubjectType {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}={}", self.subject, self.name)
+    }
 }
 
 const DRONECAN: &str = include_str!("../../data/dronecan.dsdl");

@@ -3,6 +3,7 @@
 //! A rule makes nothing a conversation by itself, unless it was asked for by its maker's name. Where frames look like a request and its
 //! answer, one exchange is enough if they follow a rule.
 
+use std::fmt;
 use std::str::FromStr;
 use std::sync::LazyLock;
 
@@ -107,6 +108,15 @@ impl FromStr for KnownPairs {
         match maker {
             Some(maker) => Ok(Self::Of(maker)),
             None => Ok(Self::One(text.parse::<Pair>()?)),
+        }
+    }
+}
+
+impl fmt::Display for KnownPairs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::One(pair) => pair.fmt(f),
+            Self::Of(maker) => f.write_str(maker.name()),
         }
     }
 }

@@ -11,6 +11,8 @@ export function readColours(element: Element): Colours {
     axis: read('--text'),
     text: read('--muted'),
     gap: read('--gap'),
+    alarmAbove: read('--alarm-above'),
+    alarmBelow: read('--alarm-below'),
     cursorA: read('--cursor-a'),
     cursorB: read('--cursor-b'),
     hover: read('--hover-line'),

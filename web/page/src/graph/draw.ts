@@ -13,6 +13,8 @@ export interface Colours {
   axis: string;
   text: string;
   gap: string;
+  alarmAbove: string;
+  alarmBelow: string;
   cursorA: string;
   cursorB: string;
   hover: string;
@@ -28,6 +30,8 @@ export interface Trace {
   texts: { value: number; text: string }[];
   /** Limits of the database; a dotted line where they are in sight. */
   limits: number[];
+  /** Where values are an alarm: shaded above and below. */
+  alarms: { min: number | null; max: number | null } | null;
 }
 
 export interface Sheet {
@@ -124,6 +128,14 @@ function columnsInSight(series: Series, range: Range): [number, number] {
   return [first, last];
 }
 
+/** What is above and below the limits of a signal's alarms. */
+function drawAlarms(pen: Pen, trace: Trace, x: Scale, y: Scale, { colours }: Sheet): void {
+  const { min, max } = trace.alarms ?? { min: null, max: null };
+  const at = (value: number): number => Math.min(y.start, Math.max(y.end, toPixel(y, value)));
+  if (max !== null && max < y.to) pen.rect(x.start, y.end, x.end - x.start, at(max) - y.end, colours.alarmAbove);
+  if (min !== null && min > y.from) pen.rect(x.start, at(min), x.end - x.start, y.start - at(min), colours.alarmBelow);
+}
+
 /** Width of an axis that stands within the picture, at its right edge. */
 const INNER_AXIS = 54;
 
@@ -138,6 +150,7 @@ function drawLines(pen: Pen, sheet: Sheet, x: Scale): void {
     const y: Scale = { ...values, start: sheet.height - BOTTOM, end: TOP };
     drawValueAxis(pen, sheet, x, y, unit, shown, traces[0]?.colour ?? sheet.colours.text);
     pen.clipped(x.start, 0, x.end - x.start, sheet.height, () => {
+      for (const trace of traces) drawAlarms(pen, trace, x, y, sheet);
       for (const trace of traces) {
         for (const limit of trace.limits) {
           if (limit > values.from && limit < values.to) pen.line([x.start, toPixel(y, limit), x.end, toPixel(y, limit)], trace.colour, 1, [2, 5]);

@@ -93,6 +93,7 @@ export class SeriesCache {
 /** A signal's columns; null if no database has it any more. */
 export async function askSeries(app: App, item: Exclude<Item, { kind: 'load' }>, { from, to }: Range, columns: number): Promise<Series | null> {
   if (item.kind === 'raw') return app.ask('rawSeries', { ...item.edit, from, to, columns });
+  if (item.kind === 'field') return item.info ? app.ask('fieldSeries', { field: item.info.key, from, to, columns }) : null;
   return item.info ? app.ask('series', { signal: item.info.key, from, to, columns }) : null;
 }
 
@@ -113,6 +114,7 @@ function isLoad(entry: Entry): boolean {
 export function keyOf(item: Item): string {
   if (item.kind === 'load') return `load ${item.channel}`;
   if (item.kind === 'raw') return `raw ${JSON.stringify(item.edit)}`;
+  if (item.kind === 'field') return `field ${item.info?.key} ${item.channel} ${item.name} ${item.between} ${item.message} ${item.which}`;
   return `signal ${item.channel} ${item.id} ${item.extended} ${item.signal} ${item.info?.key}`;
 }
 

@@ -1,7 +1,7 @@
 // What server and page say to each other; see `host/ui/src/session.rs`, `state.rs` and `request.rs`.
 
 /** What the server put into the page; `command` is the one that serves it, `cantap ui` or `cantap serve`. */
-export type Served = { version: 1; name: string; databases: import('../model/report').ServedDatabase[] } & (
+export type Served = { version: 1; name: string; databases: import('../model/report').ServedDatabase[]; connections: import('../api').Connections | null } & (
   | { kind: 'device'; command: string }
   | { kind: 'trace'; size: number; bitrates: { channel: number; bitrate: number; dataBitrate: number | null }[] }
 );

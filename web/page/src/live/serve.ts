@@ -13,7 +13,7 @@ export function servedFrom(root: Document): Served | null {
 
 /** Opens what is served. */
 export async function serve(app: App, served: Served): Promise<void> {
-  await addCarried(app, served.databases);
+  await addCarried(app, served);
   if (served.kind === 'trace') {
     try {
       await app.openTrace(await fetched(served.name), served.bitrates);

@@ -1,11 +1,12 @@
 // What all views share: the engine and what it holds, the stretch of time that is looked at, marks, notes. Views listen to topics and never
 // to each other.
 
-import type { Answer, Engine, Finding, Gap, IdRow, MessageInfo, Requests, SignalInfo, Summary } from '../api';
+import type { Answer, Connections, Engine, Finding, Gap, IdRow, MessageInfo, Requests, SignalInfo, Summary } from '../api';
 import type { Board } from '../live/board';
 import type { Connection } from '../live/connection';
 import type { Source } from '../live/source';
 import { Emitter } from './emitter';
+import { Fields } from './fields';
 import { pieces } from './files';
 import { count, plural, seconds } from './format';
 import { History } from './history';
@@ -17,7 +18,7 @@ import { type Profile, Storage } from './storage';
 /** `steady` comes with `summary`, but of a trace that grows live only about once a second: for what is costly, or is read and not watched. */
 const SEVERITIES = ['error', 'warning', 'info'];
 
-export type Topic = 'live' | 'board' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
+export type Topic = 'live' | 'board' | 'live-state' | 'steady' | 'summary' | 'messages' | 'range' | 'cursors' | 'identifier' | 'panels' | 'fields' | 'fields-read' | 'notes' | 'own' | 'profile' | 'findings' | 'engine' | 'goto';
 
 export interface Range {
   from: number;
@@ -65,6 +66,7 @@ export class App extends Emitter<Topic> {
   /** The trace's file, for saving it again as it was. */
   traceFile: File | null = null;
   databases: Database[] = [];
+  connections: Connections | null = null;
   identifier: Identifier | null = null;
   cursorA: number | null = null;
   cursorB: number | null = null;
@@ -89,6 +91,7 @@ export class App extends Emitter<Topic> {
   readonly storage = new Storage();
   readonly profile: Profile;
   readonly panels: Panels;
+  readonly fields: Fields;
   readonly zoom = new History<Range>({ from: 0, to: 1 });
   readonly own = new History<string>('');
   #fitted = true;
@@ -110,6 +113,7 @@ export class App extends Emitter<Topic> {
     this.profile = this.storage.load();
     this.panels = new Panels(() => this.panelsChanged());
     this.panels.restore(this.profile.panels);
+    this.fields = new Fields(this);
     addEventListener('beforeunload', (event) => {
       if (this.#unsaved.size > 0) event.preventDefault();
     });
@@ -161,6 +165,7 @@ export class App extends Emitter<Topic> {
       this.emit('engine');
       // The new engine has nothing of what the old one was given.
       for (const { name, bytes, channel } of this.databases) await this.ask('database', { name, bytes, channel });
+      if (this.connections) await this.ask('connections', this.connections);
       if (this.own.current !== '') await this.ask('setOwnDatabase', { dbc: this.own.current });
       if (this.live) this.live.again();
       else if (this.traceFile) await this.openTrace(this.traceFile, this.#bitrates, true);
@@ -289,6 +294,7 @@ export class App extends Emitter<Topic> {
     this.serial++;
     this.findings = null;
     this.gaps = [];
+    this.fields.forget(!again);
     if (again) return;
     this.identifier = null;
     this.cursorA = this.cursorB = null;
@@ -362,15 +368,24 @@ export class App extends Emitter<Topic> {
   async addDatabase(name: string, bytes: Uint8Array, channel: number | null): Promise<void> {
     const answer = await this.ask('database', { name, bytes, channel });
     this.databases.push({ name, bytes, channel });
+    this.fields.forget(false);
     for (const warning of answer.warnings.slice(0, 5)) this.notify('warning', `${name}: ${warning}`);
     if (answer.warnings.length > 5) this.notify('warning', `${name}: ${count(answer.warnings.length - 5)} more warnings.`);
     await this.refresh();
     this.emit('messages');
   }
 
+  /** Who talks to whom where a trace does not show it. */
+  async connect(connections: Connections): Promise<void> {
+    await this.ask('connections', connections);
+    this.connections = connections;
+    this.fields.forget(false);
+  }
+
   /** The user's own database as text: one step of undo. */
   async setOwn(dbc: string): Promise<void> {
     await this.ask('setOwnDatabase', { dbc });
+    this.fields.forget(false);
     await this.refresh();
     this.emit('own');
   }

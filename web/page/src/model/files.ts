@@ -8,18 +8,26 @@ export interface Piece {
   more: boolean;
 }
 
-/** The file's bytes in pieces: a small one first, so that a view shows its first rows at once. */
+/** The file's bytes in pieces: a small one first, so that a view shows its first rows at once. The next one is read while one is used. */
 export async function* pieces(file: Blob): AsyncGenerator<Piece, void, void> {
-  let at = 0;
-  do {
-    const end = Math.min(file.size, at + (at === 0 ? FIRST_PIECE : PIECE));
-    const bytes = new Uint8Array(await file.slice(at, end).arrayBuffer());
+  const read = (from: number, to: number): Promise<ArrayBuffer> => {
+    const bytes = file.slice(from, to).arrayBuffer();
+    // Whoever waits for it is told; nobody may, if the trace is closed before.
+    bytes.catch(() => undefined);
+    return bytes;
+  };
+  let at = Math.min(file.size, FIRST_PIECE);
+  let next: Promise<ArrayBuffer> | null = read(0, at);
+  while (next) {
+    const bytes = new Uint8Array(await next);
+    const end = Math.min(file.size, at + PIECE);
+    next = end > at ? read(at, end) : null;
     at = end;
-    yield { bytes, more: at < file.size };
-  } while (at < file.size);
+    yield { bytes, more: next !== null };
+  }
 }
 
-const DATABASES = /\.(dbc|kcd|sym|arxml|dbf|xml|eds|dcf|xdd|xdc|a2l|cdd|pdx|odx[a-z-]*|dsdl|uavcan)$/i;
+const DATABASES = /\.(dbc|toml|kcd|sym|arxml|dbf|xml|eds|dcf|xdd|xdc|a2l|cdd|pdx|odx[a-z-]*|dsdl|uavcan)$/i;
 
 /** Whether a file is taken for a database by its name; all else is taken for a trace. */
 export function isDatabase(name: string): boolean {

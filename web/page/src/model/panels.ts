@@ -1,6 +1,6 @@
 // Which graphs stand one above the other, and what each of them draws. Signals are kept by name, so that they outlive a change of the database.
 
-import type { MessageInfo, SignalEdit, SignalInfo } from '../api';
+import type { FieldInfo, MessageInfo, SignalEdit, SignalInfo } from '../api';
 import type { Profile, ProfileItem } from './storage';
 
 export type Style = 'step' | 'line' | 'points';
@@ -8,7 +8,17 @@ export type Style = 'step' | 'line' | 'points';
 export type Item =
   | { kind: 'signal'; channel: number | null; id: number; extended: boolean; signal: string; info: SignalInfo | null; message: string }
   | { kind: 'load'; channel: number }
+  | (FieldName & { kind: 'field'; info: FieldInfo | null })
   | { kind: 'raw'; edit: SignalEdit };
+
+/** What tells a protocol's number from the others. */
+export interface FieldName {
+  channel: number;
+  name: string;
+  between: string;
+  message: string;
+  which: string;
+}
 
 export interface Panel {
   /** Stable while the page lives. */
@@ -110,6 +120,16 @@ export class Panels {
     }
   }
 
+  /** Finds each number in those that protocols have now. */
+  resolveFields(fields: readonly FieldInfo[]): void {
+    for (const panel of this.list) for (const item of panel.items) if (item.kind === 'field') item.info = fields.find((field) => sameField(field, item)) ?? null;
+  }
+
+  /** Whether one of a protocol's numbers is to be drawn. */
+  get hasFields(): boolean {
+    return this.list.some((panel) => panel.items.some((item) => item.kind === 'field'));
+  }
+
   profile(): Profile['panels'] {
     return this.list.map((panel) => ({ style: panel.style, items: panel.items.flatMap(profileItem) })).filter((p) => p.items.length > 0);
   }
@@ -119,7 +139,7 @@ export class Panels {
       .map((panel) => ({
         number: this.#next++,
         style: panel.style === 'line' || panel.style === 'points' ? panel.style : ('step' as Style),
-        items: panel.items.map((item): Item => (item.kind === 'load' ? { ...item } : { ...item, info: null, message: '' })),
+        items: panel.items.map((item): Item => (item.kind === 'load' ? { ...item } : item.kind === 'field' ? { ...item, info: null } : { ...item, info: null, message: '' })),
       }))
       .filter((p) => p.items.length > 0);
   }
@@ -131,7 +151,24 @@ export class Panels {
   }
 }
 
+function sameField(a: FieldName, b: FieldName): boolean {
+  return a.channel === b.channel && a.name === b.name && a.between === b.between && a.message === b.message && a.which === b.which;
+}
+
+/** An item that draws a protocol's number. */
+export function fieldItem(info: FieldInfo): Item {
+  const { channel, name, between, message, which } = info;
+  return { kind: 'field', channel, name, between, message, which, info };
+}
+
+/** A protocol's number, without its protocol. */
+export function fieldLabel({ name, which }: FieldName): string {
+  const short = name.slice(name.indexOf('.') + 1);
+  return which === '' ? short : `${short} (${which})`;
+}
+
 export function sameItem(a: Item, b: Item): boolean {
+  if (a.kind === 'field') return b.kind === 'field' && sameField(a, b);
   if (a.kind === 'load') return b.kind === 'load' && a.channel === b.channel;
   if (a.kind === 'raw') return b.kind === 'raw' && a.edit.channel === b.edit.channel && a.edit.id === b.edit.id && a.edit.extended === b.edit.extended && a.edit.name === b.edit.name;
   return b.kind === 'signal' && a.id === b.id && a.extended === b.extended && a.channel === b.channel && a.signal === b.signal;
@@ -140,6 +177,7 @@ export function sameItem(a: Item, b: Item): boolean {
 export function itemLabel(item: Item): string {
   if (item.kind === 'load') return `Bus load, channel ${item.channel}`;
   if (item.kind === 'raw') return item.edit.name;
+  if (item.kind === 'field') return `${item.between} ${item.message}: ${fieldLabel(item)}`;
   return item.message ? `${item.message}.${item.signal}` : item.signal;
 }
 
@@ -150,12 +188,13 @@ export function itemUnit(item: Item): string {
 }
 
 export function itemTexts(item: Item): { value: number; text: string }[] {
-  if (item.kind === 'signal') return item.info?.texts ?? [];
+  if (item.kind === 'signal' || item.kind === 'field') return item.info?.texts ?? [];
   return item.kind === 'raw' ? item.edit.texts : [];
 }
 
 function profileItem(item: Item): ProfileItem[] {
   if (item.kind === 'load') return [{ kind: 'load', channel: item.channel }];
+  if (item.kind === 'field') return [{ kind: 'field', channel: item.channel, name: item.name, between: item.between, message: item.message, which: item.which }];
   if (item.kind === 'signal') return [{ kind: 'signal', channel: item.channel, id: item.id, extended: item.extended, signal: item.signal }];
   return [];
 }

@@ -1,6 +1,6 @@
 // A report: a trace, databases and notes that `cantap report` put into the page itself.
 
-import type { Finding } from '../api';
+import type { Connections, Finding } from '../api';
 import type { App } from './app';
 import { blobOfBase64, gunzip } from './files';
 
@@ -24,6 +24,8 @@ export interface Report {
   notes: string[];
   trace: Packed;
   databases: ServedDatabase[];
+  /** Null: a report of before, or none is known. */
+  connections: Connections | null;
   /** Bit rates that the trace itself does not give, in bit/s. */
   bitrates: { channel: number; bitrate: number; dataBitrate: number | null }[];
   findings: Finding[];
@@ -50,20 +52,26 @@ export function embeddedReport(root: Document): Report | null {
     notes: raw.notes ?? [],
     trace: raw.trace,
     databases: raw.databases ?? [],
+    connections: raw.connections ?? null,
     bitrates: raw.bitrates ?? [],
     findings: raw.findings ?? [],
     thinned: raw.thinned ?? [],
   };
 }
 
-/** Adds the databases that the page carries; one that is unusable is reported, and the others are added. */
-export async function addCarried(app: App, databases: readonly ServedDatabase[]): Promise<void> {
+/** Adds the databases and connections that the page carries; one that is unusable is reported, and the others are added. */
+export async function addCarried(app: App, { databases, connections }: { databases: readonly ServedDatabase[]; connections: Connections | null }): Promise<void> {
   for (const database of databases) {
     try {
       await app.addDatabase(database.name, new Uint8Array(await (await unpack(database)).arrayBuffer()), database.channel);
     } catch (error) {
       app.failed(error);
     }
+  }
+  try {
+    if (connections) await app.connect(connections);
+  } catch (error) {
+    app.failed(error);
   }
 }
 

@@ -15,7 +15,7 @@ export interface Profile {
   sendList: string[];
 }
 
-export type ProfileItem = { kind: 'signal'; channel: number | null; id: number; extended: boolean; signal: string } | { kind: 'load'; channel: number };
+export type ProfileItem = { kind: 'signal'; channel: number | null; id: number; extended: boolean; signal: string } | { kind: 'load'; channel: number } | { kind: 'field'; channel: number; name: string; between: string; message: string; which: string };
 
 export const DEFAULT_PROFILE: Profile = { cantapProfile: 1, theme: 'auto', view: 'summary', timeStyle: 'relative', panels: [], filters: [], sendList: [] };
 
@@ -72,6 +72,10 @@ function parseItem(raw: unknown): ProfileItem[] {
   if (!isObject(raw)) return [];
   const { kind, channel, id, extended, signal } = raw;
   if (kind === 'load' && typeof channel === 'number') return [{ kind, channel }];
+  if (kind === 'field' && typeof channel === 'number') {
+    const text = (name: string): string => (typeof raw[name] === 'string' ? raw[name] : '');
+    return [{ kind, channel, name: text('name'), between: text('between'), message: text('message'), which: text('which') }];
+  }
   if (kind === 'signal' && typeof id === 'number' && typeof signal === 'string') {
     return [{ kind, channel: typeof channel === 'number' ? channel : null, id, extended: extended === true, signal }];
   }

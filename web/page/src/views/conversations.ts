@@ -1,6 +1,6 @@
 // Conversations: requests, answers and announcements as a list, and as a ladder between those who speak.
 
-import type { ProtocolEvent } from '../api';
+import type { ProtocolEvent, ProtocolNode } from '../api';
 import type { App } from '../model/app';
 import { clock, count, duration, plural, seconds } from '../model/format';
 import { Latest } from '../model/latest';
@@ -26,6 +26,24 @@ const LADDER = [
   { name: 'What', class: 'c-what' },
 ];
 
+const NODES = [
+  { name: 'Ch', class: 'c-channel' },
+  { name: 'Protocol', class: 'c-protocol' },
+  { name: 'Node', class: 'c-party' },
+  { name: 'State', class: 'c-node-state' },
+  { name: 'Since / s', class: 'c-time' },
+  { name: 'Drive (CiA 402)', class: 'c-node-state' },
+  { name: 'Since / s', class: 'c-time' },
+  { name: 'Missed', class: 'c-count' },
+  { name: 'Faults', class: 'c-count' },
+  { name: 'Who it is, and trouble codes', class: 'c-what' },
+];
+const SHAPES = [
+  ['ladder', 'ladder'],
+  ['list', 'list'],
+  ['nodes', 'nodes'],
+] as [string, string][];
+
 /** Seconds that are read of a live trace. */
 const LIVE = 60;
 /** More events than this are left out, and said so. */
@@ -44,6 +62,7 @@ export class ConversationsView implements View {
   readonly element: HTMLElement;
   readonly #list: VirtualList;
   readonly #ladder: VirtualList;
+  readonly #nodeList: VirtualList;
   readonly #lanes = el('div', { class: 'lanes', attrs: { 'aria-hidden': 'true' } });
   readonly #search = el('input', { attrs: { type: 'search', placeholder: 'Search conversations', 'aria-label': 'Search conversations', spellcheck: 'false' } });
   readonly #state = el('span', { class: 'state', attrs: { role: 'status' } });
@@ -51,6 +70,9 @@ export class ConversationsView implements View {
   readonly #shape: HTMLSelectElement;
   #events: ProtocolEvent[] = [];
   #shown: ProtocolEvent[] = [];
+  #nodes: ProtocolNode[] = [];
+  #shownNodes: ProtocolNode[] = [];
+  #notCounted = 0;
   #parties: string[] = [];
   #total = 0;
   #width = LADDER_WIDTH.wide;
@@ -63,9 +85,11 @@ export class ConversationsView implements View {
   ) {
     this.#asking = new Latest(
       async () => {
-        const { events, total } = await app.ask('conversations', { from: app.live ? app.whole().to - LIVE : -Infinity, to: Infinity, limit: LIMIT });
+        const { events, total, nodes, notCounted } = await app.ask('conversations', { from: app.live ? app.whole().to - LIVE : -Infinity, to: Infinity, limit: LIMIT });
         this.#events = events;
         this.#total = total;
+        this.#nodes = nodes;
+        this.#notCounted = notCounted;
         this.#arrange();
       },
       (error) => app.failed(error),
@@ -76,20 +100,24 @@ export class ConversationsView implements View {
       app.goto(event.time);
       this.lead('trace');
     };
+    const lastChange = (index: number): void => {
+      const node = this.#shownNodes[index];
+      if (!node) return;
+      app.goto(Math.max(node.stateSince ?? -Infinity, node.driveSince ?? -Infinity, node.stateSince === null && node.driveSince === null ? node.last : -Infinity));
+      this.lead('trace');
+    };
     const isNarrow = matchMedia(NARROW).matches;
     this.#list = new VirtualList('Conversations', COLUMNS, { length: () => this.#shown.length, fill: (row, cells, index) => this.#fill(row, cells, index), opened });
     this.#ladder = new VirtualList('Conversations as a ladder', LADDER, { length: () => this.#shown.length, fill: (row, cells, index) => this.#rung(row, cells, index), opened }, isNarrow ? RUNG.narrow : RUNG.wide);
+    this.#nodeList = new VirtualList('Nodes', NODES, { length: () => this.#shownNodes.length, fill: (row, cells, index) => this.#fillNode(row, cells, index), opened: lastChange });
     this.#search.addEventListener('input', () => this.#arrange());
     this.#shape = select(
-      [
-        ['ladder', 'ladder'],
-        ['list', 'list'],
-      ],
+      SHAPES,
       'ladder',
       () => this.#shapeChanged(),
       'Shape',
     );
-    this.element = el('section', { class: 'view view-conversations', attrs: { 'aria-label': 'Conversations' } }, el('div', { class: 'bar' }, this.#search, this.#shape, this.#state), this.#lanes, this.#ladder.element, this.#list.element);
+    this.element = el('section', { class: 'view view-conversations', attrs: { 'aria-label': 'Conversations' } }, el('div', { class: 'bar' }, this.#search, this.#shape, this.#state), this.#lanes, this.#ladder.element, this.#list.element, this.#nodeList.element);
     this.element.classList.toggle('two-lines', isNarrow);
     this.#shapeChanged();
     for (const topic of ['steady', 'messages'] as const) app.on(topic, () => this.#ask());
@@ -97,11 +125,12 @@ export class ConversationsView implements View {
       { id: 'conversations.search', title: 'Conversations: search', keys: ['/'], view: this.id, run: () => this.#search.focus() },
       {
         id: 'conversations.shape',
-        title: 'Conversations: ladder or list',
+        title: 'Conversations: ladder, list or nodes',
         keys: ['l'],
         view: this.id,
         run: () => {
-          this.#shape.value = this.#shape.value === 'list' ? 'ladder' : 'list';
+          const at = SHAPES.findIndex(([shape]) => shape === this.#shape.value);
+          this.#shape.value = SHAPES[(at + 1) % SHAPES.length]?.[0] ?? 'ladder';
           this.#shapeChanged();
         },
       },
@@ -122,11 +151,12 @@ export class ConversationsView implements View {
   }
 
   #shapeChanged(): void {
-    const list = this.#shape.value === 'list';
-    this.#list.element.hidden = !list;
-    this.#ladder.element.hidden = list;
-    this.#lanes.hidden = list;
-    (list ? this.#list : this.#ladder).refresh();
+    const shape = this.#shape.value;
+    this.#list.element.hidden = shape !== 'list';
+    this.#nodeList.element.hidden = shape !== 'nodes';
+    this.#lanes.hidden = this.#ladder.element.hidden = shape !== 'ladder';
+    this.#say();
+    (shape === 'list' ? this.#list : shape === 'nodes' ? this.#nodeList : this.#ladder).refresh();
   }
 
   #arrange(): void {
@@ -134,6 +164,8 @@ export class ConversationsView implements View {
     this.element.style.setProperty('--ladder', `${this.#width}px`);
     const query = this.#search.value.trim();
     this.#shown = query === '' ? this.#events : this.#events.filter((e) => match(query, `${e.protocol} ${e.kind} ${e.from} ${e.to} ${e.text}`) !== null);
+    const about = (n: ProtocolNode): string => `${n.protocol} ${n.node} ${n.state ?? ''} ${n.drive ?? ''} ${aboutNode(n)}`;
+    this.#shownNodes = query === '' ? this.#nodes : this.#nodes.filter((n) => match(query, about(n)) !== null);
     const spoken = new Map<string, number>();
     for (const event of this.#shown) for (const party of [event.from, event.to]) if (party) spoken.set(party, (spoken.get(party) ?? 0) + 1);
     const ranked = [...spoken].sort((a, b) => b[1] - a[1]).map(([party]) => party);
@@ -146,10 +178,20 @@ export class ConversationsView implements View {
         return label;
       }),
     );
-    const left = this.#total - this.#events.length;
-    setText(this.#state, `${count(this.#shown.length)} of ${plural(this.#total, 'event')}${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}${this.#clock()}`);
+    this.#say();
     this.#list.refresh();
     this.#ladder.refresh();
+    this.#nodeList.refresh();
+  }
+
+  #say(): void {
+    if (this.#shape.value === 'nodes') {
+      const more = this.#notCounted > 0 ? `; ${plural(this.#notCounted, 'event')} of others not counted, because there are too many nodes, services or objects` : '';
+      setText(this.#state, `${count(this.#shownNodes.length)} of ${plural(this.#nodes.length, 'node')}, as they are at the end${this.app.live ? `, by the last ${LIVE} s` : ''}${more}`);
+      return;
+    }
+    const left = this.#total - this.#events.length;
+    setText(this.#state, `${count(this.#shown.length)} of ${plural(this.#total, 'event')}${this.app.live ? ` of the last ${LIVE} s` : ''}${left > 0 ? `; the last ${count(left)} are left out` : ''}${this.#clock()}`);
   }
 
   /** Whose clock measured how long they took. */
@@ -178,6 +220,16 @@ export class ConversationsView implements View {
     return true;
   }
 
+  #fillNode(row: HTMLElement, cells: HTMLElement[], index: number): boolean {
+    const node = this.#shownNodes[index];
+    if (!node) return false;
+    row.classList.toggle('failed', node.missed > 0 || node.faults > 0);
+    const since = (time: number | null): string => (time === null ? '' : seconds(time));
+    const texts = [String(node.channel), node.protocol, node.node, node.state ?? '', since(node.stateSince), node.drive ?? '', since(node.driveSince), count(node.missed), count(node.faults), aboutNode(node)];
+    for (const [i, text] of texts.entries()) setText(cells[i] as HTMLElement, text);
+    return true;
+  }
+
   #rung(row: HTMLElement, cells: HTMLElement[], index: number): boolean {
     const event = this.#shown[index];
     if (!event) return false;
@@ -198,4 +250,9 @@ export class ConversationsView implements View {
     rung.replaceChildren(svg('svg', { width: this.#width, height: 26, role: 'img', 'aria-label': event.to ? `${event.from || 'unknown'} to ${event.to}` : event.from || 'unknown' }, ...lines, ...arrow));
     return true;
   }
+}
+
+/** Who a node is, and its trouble codes. */
+function aboutNode(node: ProtocolNode): string {
+  return [node.identity ?? '', ...Object.entries(node.codes).map(([list, codes]) => `${list}: ${codes}`)].filter((text) => text !== '').join('; ');
 }

@@ -87,11 +87,13 @@ export class GraphsView implements View {
     app.on('cursors', () => this.redraw());
     app.on('notes', () => this.redraw());
     app.on('profile', () => this.redraw());
-    app.on('messages', () => {
-      this.#cache.clear();
-      this.#exact.clear();
-      this.redraw();
-    });
+    for (const topic of ['messages', 'fields'] as const) {
+      app.on(topic, () => {
+        this.#cache.clear();
+        this.#exact.clear();
+        this.redraw();
+      });
+    }
     let serial = app.serial;
     app.on('summary', () => {
       // Of a trace that has grown, what is drawn stays until the rest is there.
@@ -244,6 +246,7 @@ export class GraphsView implements View {
         colour: colours.lines[(number + i) % colours.lines.length] ?? 'gray',
         series: this.#cache.get(item, app.range, Math.max(100, Math.min(2000, width * scale))),
         texts: itemTexts(item),
+        alarms: item.kind === 'signal' ? (item.info?.alarms ?? null) : null,
         limits: item.kind === 'signal' && item.info ? [item.info.min, item.info.max].filter((v): v is number => v !== null) : [],
       }),
     );
@@ -315,8 +318,8 @@ export class GraphsView implements View {
       const trace = sheet.traces[i] as Trace;
       entry.colour.style.background = trace.colour;
       const failure = this.#cache.failure(entry.item);
-      if (failure !== null || (entry.item.kind === 'signal' && entry.item.info === null)) {
-        setText(entry.a, failure ?? 'no database has it');
+      if (failure !== null || ('info' in entry.item && entry.item.info === null)) {
+        setText(entry.a, failure ?? (entry.item.kind === 'signal' ? 'no database has it' : this.app.fields.reading ? 'is looked for' : 'no message has it'));
         continue;
       }
       const write = (value: number): string => trace.texts.find((t) => t.value === value)?.text ?? quantity(value, trace.unit, entry.item.kind === 'load' ? 4 : undefined);

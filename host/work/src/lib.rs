@@ -7,6 +7,7 @@
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
+//! | [`selftest`] | what a board can show on its own |
 //! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`calibration`], [`odx`], [`a2l`], [`eds`], [`dsdl`], [`bus_description`] | frames and their fate; a protocol's client on a device; descriptions of ECUs and buses |
 //! | [`drive`] | a drive's motion, and how it is left |
 //! | [`obd`] | a vehicle's parameters: who has which, asked again and again, as a table |
@@ -100,6 +101,8 @@ pub mod remembered_rates;
 pub mod report;
 #[cfg(feature = "buses")]
 pub mod requested_rate;
+#[cfg(feature = "buses")]
+pub mod selftest;
 #[cfg(feature = "buses")]
 pub mod sending;
 #[cfg(feature = "buses")]

@@ -22,7 +22,8 @@ from ._native import (
     Table,
     __version__,
 )
-from .device import Checksum, Counter, Device, RandomByte, boards, open
+from ._conversations import conversations
+from .device import Checksum, Counter, Device, RandomByte, boards, open, selftest
 from .diagnostics import Ecu, NegativeResponse, load_odx
 from .traces import Database, Messages, dataset, decode, encode, load_database, read, scan, search, stats, write
 
@@ -54,6 +55,7 @@ __all__ = [
     "Table",
     "__version__",
     "boards",
+    "conversations",
     "dataset",
     "decode",
     "encode",
@@ -63,6 +65,7 @@ __all__ = [
     "read",
     "scan",
     "search",
+    "selftest",
     "stats",
     "write",
 ]

@@ -18,6 +18,7 @@ from .traces import Seconds
 __all__ = [
     "CantapError",
     "CantapWarning",
+    "Conversations",
     "Database",
     "DatabaseError",
     "Device",
@@ -49,6 +50,7 @@ __all__ = [
     "refusal_text",
     "search",
     "seconds",
+    "selftest",
     "stats",
     "table_of_messages",
     "write",
@@ -84,6 +86,33 @@ class Options(TypedDict):
     zone: str | None
     strict: bool
     indexes: NotRequired[str]
+
+@type_check_only
+class Bus(TypedDict):
+    protocol: list[str]
+    fields: list[str]
+    faults: bool
+    db: Database | None
+    pair: list[str]
+    eds: list[str]
+    odx: list[str]
+    a2l: list[str]
+    xcp: list[str]
+    ccp: list[str]
+    dsdl: list[str]
+    subject: list[str]
+
+@final
+class Conversations:
+    """Records in, what they say out."""
+
+    def __new__(cls, wanted: Bus) -> Conversations: ...
+    def read(self, options: Options) -> Table:
+        """What a trace says, from its beginning to its end."""
+    def take(self, table: Any, more: bool) -> Table:
+        """What the records of a table complete; with `more` others follow."""
+    def finish(self) -> Table:
+        """What was in progress at the end."""
 
 @final
 class Database:
@@ -246,6 +275,7 @@ class Scan(Iterator[Table]):
         """The columns' names, in order."""
     def read_all(self) -> Table:
         """The rest, as one table."""
+    def _count(self) -> int: ...
     def close(self) -> None:
         """Closes the file."""
     def __iter__(self) -> Scan: ...
@@ -568,6 +598,11 @@ def table_of_messages(messages: Iterable[Any]) -> Table: ...
 def search(
     options: Options, condition: str | None, ids: list[str], data: list[str], max_count: int | None
 ) -> Table: ...
+def selftest(address: str | None, has_loop: bool, load_time: Seconds, restarts: bool) -> dict[str, Any]: ...
 def write(
-    table: Any, path: str | os.PathLike[str], format: str | None, zone: str | None
+    table: Any,
+    path: str | os.PathLike[str],
+    format: str | None,
+    zone: str | None,
+    decoder: tuple[Database, list[str]] | None,
 ) -> dict[str, int]: ...

@@ -17,8 +17,9 @@ from ._arguments import channels as _channels
 from ._arguments import rates as _rates
 from ._arguments import words as _words
 from ._native import CantapWarning, Frame, Odx, PeriodicFrame, Record, Records, Reply, Table
+from ._conversations import Paths, Protocol, _bus
 from .diagnostics import Ecu, load_odx
-from .traces import Path, Rates, Seconds
+from .traces import Databases, Path, Rates, Seconds, Words
 
 Mode: TypeAlias = Literal["listen-only", "normal", "loopback", "silent-loopback"]
 AnyFrame: TypeAlias = "Frame | str"
@@ -209,6 +210,37 @@ class Device:
             table = self._records.batch(seconds, rows)
             if len(table):
                 yield table
+
+    def conversations(
+        self,
+        seconds: Seconds = 0.1,
+        *,
+        protocol: Protocol | str | Iterable[Protocol | str] = (),
+        fields: Words = (),
+        faults: bool = False,
+        db: Databases | None = None,
+        pair: Words = (),
+        eds: Paths = (),
+        odx: Paths = (),
+        a2l: Paths = (),
+        xcp: Words = (),
+        ccp: Words = (),
+        dsdl: Paths = (),
+        subject: Words = (),
+    ) -> Iterator[Table]:
+        """Tables of what the frames of the last `seconds` or so mean, as from `cantap.conversations`, whose arguments these are, one after the other, until
+        the device is closed. None is empty.
+
+        Without `protocol`, the first three seconds show which protocols there are; what was said in them comes after that.
+        """
+        reader = _native.Conversations(_bus(protocol, fields, faults, db, pair, eds, odx, a2l, xcp, ccp, dsdl, subject))
+        for batch in self.batches(seconds):
+            table = reader.take(batch, True)
+            if len(table):
+                yield table
+        table = reader.finish()
+        if len(table):
+            yield table
 
     def _warn_of_silence(self) -> None:
         """Nothing arrives before a channel is open: who waits for it waits for ever."""
@@ -471,6 +503,16 @@ def open(
             device.close()
             raise
     return device
+
+
+def selftest(address: str | None = None, *, loop: bool = False, load_time: Seconds = 5.0, restart: bool = False) -> dict[str, Any]:
+    """Tests what a board can show on its own, as `cantap selftest` does, and returns what that prints with `--json`: `passed`, and in `steps` the name, the outcome
+    and the figures of each. Without an address it is the board that is connected. It must not be open elsewhere.
+
+    Without `loop` no channel puts a dominant bit on its bus, whatever is connected. With it, both channels send: channel 1 must be wired to channel 2, and
+    nothing else to them. `load_time`: how long each saturating load lasts. `restart`: restarts the firmware at the end.
+    """
+    return _native.selftest(address, loop, load_time, restart)
 
 
 def boards() -> list[dict[str, str | None]]:

@@ -283,18 +283,28 @@ def stats(
 
 
 def write(
-    table: Any, path: Path, *, format: str | None = None, zone: str | None = None
+    table: Any,
+    path: Path,
+    *,
+    db: Databases | None = None,
+    signals: Words = (),
+    format: str | None = None,
+    zone: str | None = None,
 ) -> dict[str, int]:
-    """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too.
+    """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too. With `db` it writes the frames' signals, or
+    those that `signals` chooses, as an MCAP file for Foxglove, whose name ends in `.mcap`.
 
-    `table` comes from this package, or anything else that exports Arrow, such as pandas and Polars; or it is a mapping of columns, or
-    messages of python-can. Of the columns of `read` only
+    `table` comes from this package, also as a `scan`, which is never in memory as a whole, or anything else that exports Arrow, such as pandas and
+    Polars; or it is a mapping of columns, or messages of python-can. Of the columns of `read` only
     `time`, `id` and `data` must be there; docs/python.md says what stands for the others, and which types are taken.
 
     An older file with that name stays unchanged until the new one is complete. Returns what the file does not carry, by kind: also
     columns that no trace has. Anything at all also causes a `CantapWarning`.
     """
-    left_out = _native.write(_table(table), path, format, zone)
+    if db is None and words(signals, "signals"):
+        raise ValueError("signals are chosen out of a database; give one with db=")
+    decoder = None if db is None else (_database(db), words(signals, "signals"))
+    left_out = _native.write(_table(table), path, format, zone, decoder)
     for what, count in left_out.items():
         warnings.warn(f"{path} does not carry {what} ({count})", CantapWarning, stacklevel=2)
     return left_out

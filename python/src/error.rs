@@ -87,6 +87,15 @@ impl Error {
     }
 }
 
+/// The error of a file that describes something, as a database does.
+pub fn of_database_file(error: anyhow::Error) -> Error {
+    let (context, words) = (error.to_string(), format!("{error:#}"));
+    match error.downcast::<io::Error>() {
+        Ok(error) => Error::Io(error, context),
+        Err(_) => Error::Database(words),
+    }
+}
+
 /// The cause of an error, if its own message does not include it.
 fn because(error: &LinkError) -> String {
     let cause = error.source().map(ToString::to_string);

@@ -4,6 +4,7 @@
 
 mod ahead;
 mod channels;
+mod conversations;
 mod database;
 mod device;
 mod encode;
@@ -22,6 +23,7 @@ mod source;
 mod table;
 mod traces;
 mod values;
+mod write;
 
 use cantap_scripts::Counting;
 use mimalloc::MiMalloc;
@@ -36,6 +38,7 @@ static ALLOCATOR: Counting<MiMalloc> = Counting(MiMalloc);
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     error::register(module)?;
+    module.add_class::<conversations::Conversations>()?;
     module.add_class::<database::Database>()?;
     module.add_class::<frame::Frame>()?;
     module.add_class::<frame::Record>()?;
@@ -44,8 +47,10 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     device::register(module)?;
     device::diagnostics::register(module)?;
     device::disturb::register(module)?;
+    device::selftest::register(module)?;
     module.add_class::<device::odx::Odx>()?;
     traces::register(module)?;
+    write::register(module)?;
     encode::register(module)?;
     messages::register(module)?;
     nodes::register(module)?;

@@ -48,6 +48,12 @@ pub fn parts<'py>(py: Python<'py>, column: &dyn Array) -> Result<Parts<'py>, Err
             };
             Ok((kind, PyBytes::new(py, &bytes), mask, Some(texts), size))
         }
+        DataType::Utf8 => {
+            let texts: &StringArray = column.as_string();
+            let texts = texts.iter().map(|text| text.unwrap_or_default().to_owned()).collect();
+            let keys: Vec<u8> = (0..column.len() as i32).flat_map(i32::to_ne_bytes).collect();
+            Ok(("int32", PyBytes::new(py, &keys), mask, Some(texts), 4))
+        }
         other => Err(Error::Format(format!("a column of {other} is not supported by NumPy"))),
     }
 }

@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use arrow_array::{RecordBatch, RecordBatchReader};
 use arrow_schema::{ArrowError, SchemaRef};
 use cantap_columns::{FrameColumns, SignalColumns};
-use cantap_signals::{Decoder, SignalValue};
-use cantap_trace::TraceRecord;
+use cantap_signals::{Decoder, MessageRef, SignalValue};
+use cantap_trace::{TraceFrame, TraceRecord};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyCapsule, PyTuple};
@@ -70,16 +70,44 @@ impl Columns {
                     table.push_event(record);
                     return None;
                 };
-                let message = decoder.decode(record.channel, frame, values)?;
-                // With chosen signals only, a message without any of them is not counted.
-                if values.is_empty() && *chosen {
-                    return None;
-                }
+                let message = decode(decoder, record.channel, frame, values, *chosen)?;
                 table.push_values(decoder, record, message, values);
                 Some(values.len())
             }
         }
     }
+
+    /// What [`Self::push`] would append.
+    fn count(&mut self, record: &TraceRecord) -> Counted {
+        let Self::Values { decoder, values, chosen, .. } = self else { return Counted::Row };
+        let Some(frame) = record.frame() else { return Counted::Row };
+        match decode(decoder, record.channel, frame, values, *chosen) {
+            Some(_) => Counted::Values(values.len() as u64),
+            None => Counted::Nothing,
+        }
+    }
+}
+
+/// The rows of a record.
+enum Counted {
+    /// One for the record itself.
+    Row,
+    /// One for each value of a frame of a message.
+    Values(u64),
+    /// A frame that no database has.
+    Nothing,
+}
+
+/// A frame's values. With chosen signals only, a message without any of them is not counted.
+fn decode(
+    decoder: &Decoder,
+    channel: u8,
+    frame: &TraceFrame,
+    values: &mut Vec<SignalValue>,
+    chosen: bool,
+) -> Option<MessageRef> {
+    let message = decoder.decode(channel, frame, values)?;
+    (!values.is_empty() || !chosen).then_some(message)
 }
 
 /// Turns records into batches.
@@ -101,6 +129,28 @@ impl Pipeline {
         let columns = Columns::new(options)?;
         let source = TraceSource::open(options, report)?;
         Ok(Self { source, columns, waiting: Vec::new(), at: 0, batch_rows, ended: false })
+    }
+
+    /// How many rows the rest has, which costs much less than making them.
+    fn count(&mut self) -> Result<u64, Error> {
+        let mut rows = 0;
+        while !self.ended {
+            for record in &self.waiting[self.at..] {
+                rows += match self.columns.count(record) {
+                    Counted::Values(values) => {
+                        self.source.counts.decoded += 1;
+                        self.source.counts.values += values;
+                        values
+                    }
+                    Counted::Row => 1,
+                    Counted::Nothing => 0,
+                };
+            }
+            self.at = 0;
+            self.ended = !self.source.next_batch(&mut self.waiting)?;
+        }
+        self.source.tell();
+        Ok(rows)
     }
 
     /// The next batch: with as many rows as requested, or up to one frame's values more; fewer at the end.
@@ -251,6 +301,18 @@ impl Scan {
             py.check_signals()?;
         }
         Ok(Table::new(Arc::clone(&self.schema), batches, Some(self.report.clone_ref(py))))
+    }
+
+    /// How many rows the rest has; they are not made.
+    fn _count(&self, py: Python<'_>) -> PyResult<u64> {
+        let Some(mut pipeline) = self.take()? else { return Ok(0) };
+        let rows = py.detach(|| {
+            let rows = pipeline.count();
+            self.put_back(State::Ended);
+            rows
+        })?;
+        warn(py, self.report.get(), &self.named)?;
+        Ok(rows)
     }
 
     /// Closes the file.

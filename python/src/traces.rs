@@ -1,16 +1,13 @@
 //! Operations on a whole trace.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::{fs, io};
 
-use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
+use arrow_array::{ArrayRef, RecordBatch, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
-#[cfg(feature = "parquet")]
-use cantap_columns::parquet::ParquetFile;
 use cantap_columns::{BATCH_ROWS, FrameColumns, MessageTables};
-use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_formats::Format;
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
 use cantap_signals::{Decoder, Selection};
@@ -22,25 +19,25 @@ use crate::database::Database;
 use crate::error::Error;
 use crate::grammar::{BitRate, OfTrace, Seconds};
 use crate::number::Whole;
-use crate::report::{Report, by_kind, from_json};
+use crate::report::{Report, from_json};
 use crate::scan::{warn, warn_if_nothing_decoded, warning};
 use crate::selection::{only, selection};
 use crate::source::{Options, TraceSource};
 use crate::table::{Table, batches_of};
 
-/// Reads a trace to the end; Ctrl-C stops it.
-fn walk(
+/// Reads a trace to the end, some records at a time; Ctrl-C stops it.
+pub fn walk(
     py: Python<'_>,
     options: &Options,
     report: &Report,
-    mut each: impl FnMut(&cantap::TraceRecord) -> Result<(), Error> + Send,
+    mut take: impl FnMut(&[cantap::TraceRecord]) -> Result<(), Error> + Send,
 ) -> PyResult<()> {
     let for_source = report.clone();
     let mut source = py.detach(|| TraceSource::open(options, for_source))?;
     let mut records = Vec::new();
     while py.detach(|| -> Result<bool, Error> {
         let more = source.next_batch(&mut records)?;
-        records.iter().try_for_each(&mut each)?;
+        take(&records)?;
         Ok(more)
     })? {
         py.check_signals()?;
@@ -75,8 +72,10 @@ pub fn stats(
     });
     let mut statistics = statistics.map_err(Error::argument)?;
     let report = Report::default();
-    walk(py, &options, &report, |record| {
-        statistics.push(record);
+    walk(py, &options, &report, |records| {
+        for record in records {
+            statistics.push(record);
+        }
         Ok(())
     })?;
     statistics.finish();
@@ -190,9 +189,11 @@ pub fn decode_table(
     let mut channels = Channels::default();
     for batch in batches_of(table)? {
         py.detach(|| {
-            each_record(batch, &mut rows, |record| {
-                channels.insert(record.channel);
-                tables.push(record);
+            each_part(batch, &mut rows, |records| {
+                for record in records {
+                    channels.insert(record.channel);
+                    tables.push(record);
+                }
                 Ok(())
             })
         })?;
@@ -250,13 +251,15 @@ pub fn search(
     let (mut found, mut places) = (FrameColumns::default(), Vec::new());
     let mut place = 0_u64;
     let report = Report::default();
-    walk(py, &options, &report, |record| {
-        let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most.0);
-        if search.finds(record) && is_wanted {
-            found.push(record);
-            places.push(place);
+    walk(py, &options, &report, |records| {
+        for record in records {
+            let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most.0);
+            if search.finds(record) && is_wanted {
+                found.push(record);
+                places.push(place);
+            }
+            place += 1;
         }
-        place += 1;
         Ok(())
     })?;
     let batch = found.take();
@@ -270,138 +273,20 @@ pub fn search(
     Ok(Table::new(schema, vec![batch], Some(Py::new(py, report)?)))
 }
 
-/// Writes a table of records as a trace. An older file with its name stays unchanged until this one is
-/// complete.
-#[pyfunction]
-pub fn write<'py>(
-    py: Python<'py>,
-    table: &Bound<'py, PyAny>,
-    path: PathBuf,
-    format: Option<String>,
-    zone: Option<String>,
-) -> PyResult<Bound<'py, PyAny>> {
-    let batches = batches_of(table)?;
-    let schema = batches.schema();
-    // Check this before creating anything; a table without rows must also be one of records.
-    cantap_columns::records(&RecordBatch::new_empty(Arc::clone(&schema))).map_err(Error::from)?;
-    let is_parquet = path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
-    let (left_out, rows) = py.detach(|| -> Result<_, Error> {
-        if is_parquet && format.is_none() {
-            return write_parquet(batches, &path);
-        }
-        let options = WriteOptions {
-            format: format.as_deref().map(str::parse).transpose().map_err(Error::argument)?,
-            zone: zone.as_deref().map(str::parse).transpose().map_err(Error::argument)?.unwrap_or_default(),
-            ..WriteOptions::default()
-        };
-        write_trace(batches, &path, options)
-    })?;
-    let mut counts = serde_json::to_value(by_kind(&left_out)).unwrap_or_default();
-    for column in schema.fields().iter().map(|field| field.name()) {
-        if FrameColumns::schema().column_with_name(column).is_none() && !is_about_rows(column) {
-            counts[format!("the column '{column}'")] = rows.into();
-        }
-    }
-    from_json(py, &counts.to_string())
-}
-
-/// Whether a column says where rows came from: that of `search`, and the index of pandas.
-fn is_about_rows(column: &str) -> bool {
-    column == "place" || column.starts_with("__index_level_")
-}
-
 /// Converts a batch back to records, a part at a time: other programs make batches of any size. `rows` counts those of all batches.
-fn each_record(
+pub fn each_part(
     batch: Result<RecordBatch, arrow_schema::ArrowError>,
     rows: &mut usize,
-    mut each: impl FnMut(&cantap::TraceRecord) -> Result<(), Error>,
+    mut take: impl FnMut(&[cantap::TraceRecord]) -> Result<(), Error>,
 ) -> Result<(), Error> {
     let batch = batch.map_err(|error| Error::Format(error.to_string()))?;
     for at in (0..batch.num_rows()).step_by(BATCH_ROWS) {
         let part = batch.slice(at, BATCH_ROWS.min(batch.num_rows() - at));
         let records = cantap_columns::records(&part).map_err(|error| error.after(*rows))?;
-        records.iter().try_for_each(&mut each)?;
+        take(&records)?;
         *rows += records.len();
     }
     Ok(())
-}
-
-#[cfg(not(feature = "parquet"))]
-fn write_parquet(_: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
-    Err(Error::Format(format!(
-        "{}: this build of cantap writes no Parquet; build it with the feature 'parquet', or pass the table's to_pyarrow() to \
-         pyarrow.parquet.write_table",
-        path.display()
-    )))
-}
-
-#[cfg(feature = "parquet")]
-fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<(LeftOut, usize), Error> {
-    let mut file = ParquetFile::create(path, FrameColumns::default())?;
-    let mut rows = 0;
-    for batch in batches {
-        each_record(batch, &mut rows, |record| {
-            file.table.push(record);
-            Ok(())
-        })?;
-        file.flush()?;
-    }
-    file.finish()?;
-    Ok((LeftOut::default(), rows))
-}
-
-fn write_trace(
-    batches: Box<dyn RecordBatchReader + Send>,
-    path: &Path,
-    mut options: WriteOptions,
-) -> Result<(LeftOut, usize), Error> {
-    let failed = |error: io::Error| match error.kind() {
-        // The name indicates no format, or one that can only be read.
-        io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported => Error::Format(error.to_string()),
-        _ => Error::of_file(error, path),
-    };
-    if options.format.is_none() {
-        options.format = Some(Format::of_path(path).map_err(|error| Error::Format(error.to_string()))?);
-    }
-    // A pipe or a device is written to directly.
-    let is_file = !path.exists() || path.is_file();
-    let temporary = if is_file { Temporary::next_to(path).map_err(failed)? } else { None };
-    let written = temporary.as_ref().map_or(path, |temporary| &temporary.0);
-    let mut writer: Box<dyn TraceWriter> = create_writer(written, &options).map_err(failed)?;
-    let mut rows = 0;
-    for batch in batches {
-        each_record(batch, &mut rows, |record| writer.write(record).map_err(failed))?;
-    }
-    let left_out = writer.finish().map_err(failed)?;
-    if let Some(temporary) = &temporary {
-        // A link remains a link.
-        let place = path.canonicalize().unwrap_or_else(|_| path.to_owned());
-        fs::rename(&temporary.0, place).map_err(failed)?;
-    }
-    Ok((left_out, rows))
-}
-
-/// A file that is removed on drop if it still exists. Its suffix is that of the final file, which determines format and
-/// compression.
-struct Temporary(PathBuf);
-
-impl Temporary {
-    fn next_to(path: &Path) -> io::Result<Option<Self>> {
-        let place = if path.exists() { path.canonicalize()? } else { path.to_owned() };
-        let Some(name) = place.file_name() else { return Ok(None) };
-        let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
-        temporary.push(name);
-        let temporary = place.with_file_name(temporary);
-        // In a common folder a stranger may have put a link there, which must be neither followed nor removed.
-        fs::File::create_new(&temporary)?;
-        Ok(Some(Self(temporary)))
-    }
-}
-
-impl Drop for Temporary {
-    fn drop(&mut self) {
-        let _ = fs::remove_file(&self.0);
-    }
 }
 
 /// Whether a file's name is that of a trace. Tables of decoded signals end in `.parquet`, too, and much else does in `.json`: such a file is only read if
@@ -418,6 +303,5 @@ pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(decode_table, module)?)?;
     module.add_function(wrap_pyfunction!(divide, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;
-    module.add_function(wrap_pyfunction!(stats, module)?)?;
-    module.add_function(wrap_pyfunction!(write, module)?)
+    module.add_function(wrap_pyfunction!(stats, module)?)
 }

@@ -42,10 +42,12 @@ pub fn values<'py>(py: Python<'py>, column: &dyn Array) -> PyResult<Bound<'py, P
         DataType::Dictionary(..) => {
             let dictionary = column.as_any_dictionary();
             let texts: &StringArray = dictionary.values().as_string();
-            let keys = dictionary.normalized_keys();
+            // There are no texts if no row has one.
+            let keys = if texts.is_empty() { vec![0; column.len()] } else { dictionary.normalized_keys() };
             let text = |(row, key): (usize, &usize)| column.is_valid(row).then(|| texts.value(*key));
             PyList::new(py, keys.iter().enumerate().map(text).collect::<Vec<_>>())
         }
+        DataType::Utf8 => PyList::new(py, column.as_string::<i32>().iter()),
         other => Err(Error::Format(format!("a column of {other} has no values for Python")).into()),
     }
 }

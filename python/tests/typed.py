@@ -1,6 +1,7 @@
 """What a program that is checked with `mypy --strict` may pass and gets: checked by `cargo xtask ci --only python`, and never run."""
 
 import datetime
+from typing import Any
 
 import cantap
 import numpy as np
@@ -27,3 +28,10 @@ assert_type(table.schema["time"], str)
 assert_type(table[0], cantap.Row)
 for row in cantap.search("drive.blf", id=[0x123, "18FEF1??"]):
     assert_type(row, cantap.Row)
+said = cantap.conversations("drive.blf", protocol=["uds", "obd"], fields="uds.*", db="car.dbc", start=moment)
+assert_type(said, cantap.Table)
+assert_type(cantap.write(said, "drive.mcap", db="car.dbc", signals=["Speed"]), dict[str, int])
+with cantap.open("virtual") as device:
+    for table in device.conversations(0.5, protocol="j1939"):
+        assert_type(table, cantap.Table)
+assert_type(cantap.selftest("virtual", load_time="1s")["passed"], Any)

@@ -15,10 +15,12 @@ use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 use cantap_protocols::{Event, EventKind};
 use cantap_trace::counted;
 use cantap_trace::grammar;
+use cantap_work::eds::SheetPath;
+use cantap_work::report::Reporter;
 
 use crate::args;
-use crate::protocols::SheetPath;
 use crate::speak_args::SpeakArgs;
+use crate::stderr;
 use crate::usage_error::usage;
 
 /// The command line.
@@ -145,8 +147,8 @@ const ANSWER: Duration = Duration::from_secs(1);
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let sheets =
-        args.sheets.iter().map(|path| path.load(args.speak.json)).collect::<anyhow::Result<Vec<_>>>()?;
+    let reporter = if args.speak.json { Reporter::silent() } else { stderr::reporter() };
+    let sheets = args.sheets.iter().map(|path| path.load(&reporter)).collect::<anyhow::Result<Vec<_>>>()?;
     let ns = |default: Duration| args::nanoseconds(args.timeout.unwrap_or(default));
     let times =
         |default| objects::Times { timeout_ns: ns(default), patience_ns: args::nanoseconds(args.patience) };

@@ -2,28 +2,27 @@
 //! protocols.
 
 mod known;
-mod sheet;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::Context as _;
 use cantap_protocols::Options;
-use cantap_protocols::calibration::{Known as KnownConnections, MasterSlave};
+use cantap_protocols::calibration::MasterSlave;
 use cantap_protocols::dsdl::{DsdlSource, SubjectType};
 use cantap_protocols::iso_tp::{KnownPairs, Maker};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
-use cantap_work::a2l;
+use cantap_work::bus_description::BusDescription;
 use cantap_work::dsdl;
-use cantap_work::odx::{self, OdxPath};
+use cantap_work::eds::SheetPath;
+use cantap_work::odx::OdxPath;
 use cantap_work::reading::Reading;
 use cantap_work::report::Reporter;
 use clap::Arg;
 use serde_json::{Value, json};
 
 pub use self::known::{Known, named};
-pub use self::sheet::SheetPath;
 
 use crate::page::{self, Carried, Described};
 use crate::stderr;
@@ -121,18 +120,9 @@ impl ProtocolArgs {
     /// The library's options; what is not understood in a sheet or description is reported on standard error, unless
     /// `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
-        let sheets =
-            self.described.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
-        let descriptions = odx::load(&self.described.odx, &reporter(quiet))?;
-        let mut pairs = self.pairs.clone();
-        pairs.extend(descriptions.iter().flat_map(|descriptions| descriptions.pairs()).map(KnownPairs::from));
-        let calibration = KnownConnections {
-            xcp: self.xcp.clone(),
-            ccp: self.ccp.clone(),
-            descriptions: a2l::load(&self.described.a2l, &reporter(quiet))?,
-        };
-        let types = dsdl::load(&self.described.dsdl, &self.subjects, &reporter(quiet))?;
-        Ok(Options { pairs, sheets, descriptions, calibration, types, ..Options::default() })
+        let DescriptionArgs { sheets, odx, a2l, dsdl } = &self.described;
+        let Self { pairs, xcp, ccp, subjects, .. } = self;
+        BusDescription { pairs, sheets, odx, a2l, xcp, ccp, dsdl, subjects }.options(&reporter(quiet))
     }
 }
 

@@ -201,6 +201,23 @@ impl Field {
     }
 }
 
+impl Field {
+    /// What a table has beside the number: what the value stands for, or the value itself if it is a text, bytes as `0A F1`, or `not available`.
+    /// A text that stands for something is followed by that: `P0133 (O2 sensor slow response)`.
+    pub fn text_for_tables(&self) -> Option<Cow<'_, str>> {
+        let own = match &self.value {
+            Value::Text(text) => Some(Cow::Borrowed(&**text)),
+            Value::Bytes(bytes) => Some(crate::text::hex(bytes).into()),
+            Value::Missing => Some("not available".into()),
+            Value::Number(_) | Value::Hex(..) | Value::Real(_) => None,
+        };
+        match (own, &self.text) {
+            (Some(own), Some(text)) => Some(format!("{own} ({text})").into()),
+            (own, text) => own.or_else(|| text.as_deref().map(Cow::Borrowed)),
+        }
+    }
+}
+
 impl Value {
     /// As a number, if it is one.
     pub fn as_number(&self) -> Option<f64> {
@@ -248,5 +265,24 @@ impl Event {
 impl From<Id> for Party {
     fn from(id: Id) -> Self {
         Self::Id(id)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A table has one column for both: neither hides the other.
+    #[test]
+    fn a_text_that_stands_for_something_stays_beside_it() {
+        let text = |field: Field| field.text_for_tables().map(Cow::into_owned);
+        let code = Field::text("dtc", "P0133");
+        assert_eq!(text(code.clone()).as_deref(), Some("P0133"));
+        assert_eq!(text(code.meaning(Some("slow sensor"))).as_deref(), Some("P0133 (slow sensor)"));
+        assert_eq!(text(Field::number("nrc", 0x33)), None);
+        let refused = Field::number("nrc", 0x33).meaning(Some("securityAccessDenied"));
+        assert_eq!(text(refused).as_deref(), Some("securityAccessDenied"));
+        assert_eq!(text(Field::bytes("data", &[0x0A, 0xF1])).as_deref(), Some("0A F1"));
+        assert_eq!(text(Field::missing("level")).as_deref(), Some("not available"));
     }
 }

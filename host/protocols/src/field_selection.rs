@@ -1,10 +1,10 @@
-//! Selects fields of events by name, for pictures.
+//! Selects fields of events by name, for pictures and tables.
 
 use cantap_signals::SelectionError;
 use glob::Pattern;
 
 use crate::canopen::drive::DriveState;
-use crate::{Event, EventKind, Protocol, Value, naming};
+use crate::{Event, EventKind, Field, Protocol, Value, naming};
 
 /// A node's state by its heartbeat, with [`MISSING`] while that is missing.
 const NODE_STATE: &str = "nmt_state";
@@ -18,7 +18,7 @@ const MISSING: f64 = -1.0;
 #[derive(Clone, Debug, Default)]
 pub struct FieldSelection {
     patterns: Vec<(Protocol, Pattern, String)>,
-    /// Whether each of them has matched.
+    /// Whether each of them has matched a value.
     matched: Vec<bool>,
 }
 
@@ -69,49 +69,67 @@ impl FieldSelection {
         protocols
     }
 
-    /// The patterns that have matched no number yet.
+    /// The patterns that have matched no value yet.
     pub fn unmatched(&self) -> impl Iterator<Item = &str> {
         let all = self.patterns.iter().zip(&self.matched);
         all.filter(|(_, matched)| !**matched).map(|((.., text), _)| text.as_str())
     }
 
+    /// All of an event's fields, each with its name: `j1939.engine_speed`.
+    pub fn all(event: &Event) -> Vec<(String, &Field)> {
+        let named = naming::fields(event).into_iter();
+        named.map(|(name, field)| (format!("{}.{name}", event.protocol), field)).collect()
+    }
+
+    /// The event's selected fields, each with its name: `j1939.engine_speed`.
+    pub fn fields<'a>(&mut self, event: &'a Event) -> Vec<(String, &'a Field)> {
+        let protocol = event.protocol;
+        let chosen = self.chosen(event, |field| field.value != Value::Missing);
+        chosen.into_iter().map(|(name, field)| (format!("{protocol}.{name}"), field)).collect()
+    }
+
     /// The event's selected numbers.
     pub fn take<'a>(&mut self, event: &'a Event) -> Vec<FieldValue<'a>> {
-        if !self.patterns.iter().any(|(protocol, ..)| *protocol == event.protocol) {
-            return Vec::new();
-        }
         let mut values = self.states(event);
-        let fields = naming::fields(event);
-        let between = format!("{} > {}", event.from, event.to);
-        for (name, field) in &fields {
-            let value = match field.value {
-                Value::Missing => f64::NAN,
-                _ => match field.value.as_number() {
-                    Some(value) => value,
-                    None => continue,
-                },
-            };
-            let first = naming::plain(&field.name);
-            if self.selects(event.protocol, [name, &first], value.is_finite()) {
-                values.push(FieldValue {
-                    name: format!("{}.{name}", event.protocol),
-                    parts: [between.clone(), event.title.to_string(), which(&fields, name)],
-                    unit: &field.unit,
-                    value,
-                    text: field.text.as_deref(),
-                });
-            }
+        let chosen = self.chosen(event, |field| field.value.as_number().is_some_and(f64::is_finite));
+        if chosen.is_empty() {
+            return values;
         }
+        let number = |field: &Field| {
+            if field.value == Value::Missing { Some(f64::NAN) } else { field.value.as_number() }
+        };
+        let all = naming::fields(event);
+        let numbers = chosen.iter().filter_map(|(name, field)| Some((name, *field, number(field)?)));
+        let value = |(name, field, value): (&String, &'a Field, f64)| FieldValue {
+            name: format!("{}.{name}", event.protocol),
+            parts: [format!("{} > {}", event.from, event.to), event.title.to_string(), which(&all, name)],
+            unit: &field.unit,
+            value,
+            text: field.text.as_deref(),
+        };
+        values.extend(numbers.map(value));
         values
     }
 
-    /// Whether one of these names is selected; `is_number`: then what selects it has matched.
-    fn selects(&mut self, of: Protocol, names: [&str; 2], is_number: bool) -> bool {
+    /// The selected fields with their names in plain form. A pattern has matched where `counts` is true.
+    fn chosen<'a>(&mut self, event: &'a Event, counts: impl Fn(&Field) -> bool) -> Vec<(String, &'a Field)> {
+        if !self.patterns.iter().any(|(protocol, ..)| *protocol == event.protocol) {
+            return Vec::new();
+        }
+        let mut chosen = naming::fields(event);
+        chosen.retain(|(name, field)| {
+            self.selects(event.protocol, [name, &naming::plain(&field.name)], counts(field))
+        });
+        chosen
+    }
+
+    /// Whether one of these names is selected; `counts`: then what selects it has matched.
+    fn selects(&mut self, of: Protocol, names: [&str; 2], counts: bool) -> bool {
         let mut is_selected = false;
         for ((protocol, pattern, _), matched) in self.patterns.iter().zip(&mut self.matched) {
             if *protocol == of && names.iter().any(|name| pattern.matches(name)) {
                 is_selected = true;
-                *matched |= is_number;
+                *matched |= counts;
             }
         }
         is_selected

@@ -25,9 +25,8 @@ impl Event {
         push_party(out, ",\"to\":", event.to);
         out.push_str(",\"title\":");
         push_text(out, &event.title);
-        out.push_str(",\"fields\":{");
-        push_members(out, &event.fields, |field| Some(&field.value), push_value);
-        out.push('}');
+        out.push_str(",\"fields\":");
+        event.push_fields_json(out);
         if event.fields.iter().any(|field| field.text.is_some()) {
             out.push_str(",\"texts\":{");
             push_members(out, &event.fields, |field| field.text.as_deref(), push_text);
@@ -53,6 +52,13 @@ impl Event {
         if event.frames_lost {
             out.push_str(",\"frames_lost\":true");
         }
+        out.push('}');
+    }
+
+    /// Appends its fields as an object: what [`Self::push_json`] has under `fields`.
+    pub fn push_fields_json(&self, out: &mut String) {
+        out.push('{');
+        push_members(out, &self.fields, |field| Some(&field.value), push_value);
         out.push('}');
     }
 }

@@ -7,7 +7,8 @@
 //! | [`channel_options`], [`timing_options`], [`bus_off`] | how channels are opened, and brought back from bus-off |
 //! | [`live`], [`reception`] | records of devices that may come and go; a channel that receives only errors |
 //! | [`doctor`], [`bus_hints`], `port_access` (Linux) | what is the matter with a port, a device or a bus, and what to do next |
-//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`calibration`], [`odx`], [`a2l`] | frames and their fate; a protocol's client on a device; descriptions of ECUs |
+//! | [`selftest`] | what a board can show on its own |
+//! | [`sending`], [`speaking`], [`uds`], [`uds_memory`], [`calibration`], [`odx`], [`a2l`], [`eds`], [`dsdl`], [`bus_description`] | frames and their fate; a protocol's client on a device; descriptions of ECUs and buses |
 //! | [`drive`] | a drive's motion, and how it is left |
 //! | [`obd`] | a vehicle's parameters: who has which, asked again and again, as a table |
 //! | [`changing`], [`disturbance`] | messages whose values change with time; error frames on purpose |
@@ -30,6 +31,8 @@ pub mod atomic_file;
 pub mod bit_rate_search;
 #[cfg(feature = "buses")]
 pub mod boards;
+#[cfg(feature = "buses")]
+pub mod bus_description;
 #[cfg(feature = "buses")]
 pub mod bus_hints;
 #[cfg(feature = "buses")]
@@ -62,6 +65,8 @@ pub mod doctor;
 pub mod drive;
 #[cfg(feature = "buses")]
 pub mod dsdl;
+#[cfg(feature = "buses")]
+pub mod eds;
 #[cfg(feature = "buses")]
 pub mod gateway;
 pub mod interrupt;
@@ -96,6 +101,8 @@ pub mod remembered_rates;
 pub mod report;
 #[cfg(feature = "buses")]
 pub mod requested_rate;
+#[cfg(feature = "buses")]
+pub mod selftest;
 #[cfg(feature = "buses")]
 pub mod sending;
 #[cfg(feature = "buses")]

@@ -111,15 +111,12 @@ class _Stream:
 
 
 class _Counted:
-    """Rows that nobody wants yet."""
+    """Rows that nobody wants yet, and that are not made."""
 
     def __enter__(self) -> _Counted:
         return self
 
     def __exit__(self, *error: object) -> None:
-        pass
-
-    def write(self, part: str, batch: pa.RecordBatch, first_row: int) -> None:
         pass
 
     def names(self) -> dict[str, dict[str, int]]:
@@ -136,6 +133,8 @@ def _rows(request: Request) -> _Stream | Writing | _Counted:
 
 def _write(rows: _Stream | Writing | _Counted, scan: cantap.Scan, part: str, first_row: int) -> int:
     """Writes all rows, and returns their number."""
+    if isinstance(rows, _Counted):
+        return scan._count()
     count = 0
     for batch in _batches(scan):
         rows.write(part, batch, first_row + count)

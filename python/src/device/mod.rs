@@ -8,6 +8,7 @@ mod gateway;
 mod lock;
 pub mod odx;
 mod records;
+pub mod selftest;
 mod session;
 mod tasks;
 mod transmissions;

@@ -2,29 +2,21 @@
 
 use std::io::{self, Write};
 
-use cantap_protocols::{Event, Party, Value, naming};
+use cantap_protocols::{Event, Field, Party, Value, naming};
 use cantap_trace::Interface;
 
 use super::csv::Cells;
 use cantap_trace::Seconds;
 
-/// Names and values, followed by those that every event has.
-fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
-    let own = naming::fields(event).into_iter().map(|(name, field)| {
-        (name, field.value.clone(), field.unit.to_string(), field.text.as_ref().map(ToString::to_string))
-    });
+/// The fields by their names in columns, followed by those that every event has.
+fn fields(event: &Event) -> Vec<Field> {
+    let own = naming::fields(event);
+    let own = own.into_iter().map(|(name, field)| Field { name: name.into(), ..field.clone() });
     let mut fields: Vec<_> = own.collect();
-    let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
-    add("kind", Value::Text(event.kind.name().into()));
-    if let Some(ns) = event.response_ns {
-        add("response_ms", Value::Real(ns as f64 / 1e6));
-    }
-    if let Some(trouble) = &event.trouble {
-        add("trouble", Value::Text(trouble.code().into()));
-    }
-    if event.frames_lost {
-        add("frames_lost", Value::Number(1));
-    }
+    fields.push(Field::text("kind", event.kind.name()));
+    fields.extend(event.response_ns.map(|ns| Field::real("response_ms", ns as f64 / 1e6, "")));
+    fields.extend(event.trouble.map(|trouble| Field::text("trouble", trouble.code())));
+    fields.extend(event.frames_lost.then(|| Field::number("frames_lost", 1)));
     fields
 }
 
@@ -32,7 +24,8 @@ fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
 pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<String>)> {
     let protocol = event.protocol;
     let own = event.fields.len();
-    fields(event).into_iter().enumerate().filter_map(move |(place, (name, value, unit, _))| {
+    fields(event).into_iter().enumerate().filter_map(move |(place, field)| {
+        let Field { name, value, unit, .. } = field;
         let number = match value {
             Value::Number(number) => Some(number.to_string()),
             Value::Hex(number, _) => Some(number.to_string()),
@@ -41,7 +34,7 @@ pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<St
             _ if place >= own => return None,
             _ => None,
         };
-        Some((format!("{protocol}.{name}"), unit, number))
+        Some((format!("{protocol}.{name}"), unit.into_owned(), number))
     })
 }
 
@@ -57,24 +50,23 @@ pub fn text(out: &mut impl Write, event: &Event) -> io::Result<()> {
 
 /// A line per field; texts are in the last column.
 pub fn csv(out: &mut impl Write, event: &Event, cells: Cells) -> io::Result<()> {
-    for (name, value, unit, text) in fields(event) {
-        let (number, own) = match &value {
-            Value::Number(_) | Value::Real(_) => (value.to_string(), None),
-            Value::Hex(number, _) => (number.to_string(), None),
-            Value::Text(text) => (String::new(), Some(text.to_string())),
-            Value::Bytes(_) => (String::new(), Some(value.to_string())),
-            Value::Missing => (String::new(), Some("not available".to_owned())),
+    for field in fields(event) {
+        let number = match &field.value {
+            Value::Number(_) | Value::Real(_) => field.value.to_string(),
+            Value::Hex(number, _) => number.to_string(),
+            Value::Text(_) | Value::Bytes(_) | Value::Missing => String::new(),
         };
         write!(
             out,
-            "{},{},{},{},{}.{name},{number},{},{}\r\n",
+            "{},{},{},{},{}.{},{number},{},{}\r\n",
             Seconds(event.time_ns),
             event.channel,
             sender(event),
             cells.field(&event.title),
             event.protocol,
-            cells.field(&unit),
-            cells.field(&text.or(own).unwrap_or_default())
+            field.name,
+            cells.field(&field.unit),
+            cells.field(&field.text_for_tables().unwrap_or_default())
         )?;
     }
     Ok(())
@@ -83,15 +75,15 @@ pub fn csv(out: &mut impl Write, event: &Event, cells: Cells) -> io::Result<()> 
 /// An object; with `details` each value is an object too.
 pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()> {
     let mut signals = serde_json::Map::new();
-    for (name, value, unit, text) in fields(event) {
+    for Field { name, value, unit, text } in fields(event) {
         let value = serde_json::Value::from(&value);
         let value = if details {
             let mut object = serde_json::json!({ "value": value });
             if !unit.is_empty() {
-                object["unit"] = unit.into();
+                object["unit"] = unit.into_owned().into();
             }
             if let Some(text) = text {
-                object["text"] = text.into();
+                object["text"] = text.into_owned().into();
             }
             object
         } else {

@@ -4,8 +4,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use cantap_work::interrupt;
-
 /// How often to check whether to go on.
 const SLICE: Duration = Duration::from_millis(20);
 /// A program that is held up for this long at a time cannot judge a device's answers: it is a seventh of what the session
@@ -17,21 +15,42 @@ const TOO_BUSY: Duration = Duration::from_millis(200);
 #[error("Ctrl-C ended it")]
 pub struct Interrupted;
 
-/// An error if Ctrl-C was pressed.
-pub fn check() -> Result<(), Interrupted> {
-    if interrupt::requested() { Err(Interrupted) } else { Ok(()) }
-}
+/// How long to go on.
+#[derive(Clone)]
+pub struct Patience(Arc<dyn Fn() -> bool + Send + Sync>);
 
-/// Waits for this long, unless Ctrl-C is pressed.
-pub fn pause(time: Duration) -> Result<(), Interrupted> {
-    let until = Instant::now() + time;
-    loop {
-        check()?;
-        let left = until.saturating_duration_since(Instant::now());
-        if left.is_zero() {
-            return Ok(());
+impl Patience {
+    /// Until this returns true, which it is asked often.
+    pub fn until(is_over: impl Fn() -> bool + Send + Sync + 'static) -> Self {
+        Self(Arc::new(is_over))
+    }
+
+    /// To the end.
+    pub fn endless() -> Self {
+        Self::until(|| false)
+    }
+
+    /// Whether it is over.
+    pub(super) fn is_over(&self) -> bool {
+        (self.0)()
+    }
+
+    /// An error if it is over.
+    pub(super) fn check(&self) -> Result<(), Interrupted> {
+        if self.is_over() { Err(Interrupted) } else { Ok(()) }
+    }
+
+    /// Waits for this long, unless it is over before.
+    pub(super) fn pause(&self, time: Duration) -> Result<(), Interrupted> {
+        let until = Instant::now() + time;
+        loop {
+            self.check()?;
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Ok(());
+            }
+            std::thread::sleep(left.min(SLICE));
         }
-        std::thread::sleep(left.min(SLICE));
     }
 }
 

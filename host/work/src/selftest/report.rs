@@ -7,9 +7,8 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use cantap::{Device, DeviceError};
 use serde_json::{Value, json};
 
-use super::patience::{BusyWatch, Interrupted};
+use super::patience::{BusyWatch, Interrupted, Patience};
 use cantap_address::Address;
-use cantap_work::interrupt;
 
 /// The result of a step.
 #[derive(Clone, Debug)]
@@ -58,6 +57,8 @@ pub struct Report {
     #[serde(skip)]
     lines: Lines,
     #[serde(skip)]
+    patience: Patience,
+    #[serde(skip)]
     busy: BusyWatch,
     /// The step in which the connection was lost.
     #[serde(skip)]
@@ -68,8 +69,10 @@ pub struct Report {
 pub enum Lines {
     /// Nowhere: they are wanted at the end, or as an object.
     Kept,
-    /// To standard output. Nobody may read it any more; the report is made even so if it goes elsewhere, too.
+    /// To an output. Nobody may read it any more; the report is made even so if it goes elsewhere, too.
     Shown {
+        /// The output.
+        out: Box<dyn Write + Send>,
         /// Whether the report also goes elsewhere.
         is_kept: bool,
     },
@@ -84,7 +87,7 @@ pub enum Lines {
 
 impl Report {
     /// Nothing has been tested yet.
-    pub fn new(address: &Address, device: &Device, lines: Lines) -> Self {
+    pub fn new(address: &Address, device: &Device, lines: Lines, patience: Patience) -> Self {
         let hello = device.hello();
         let [major, minor, patch] = hello.firmware;
         let mut report = Self {
@@ -102,6 +105,7 @@ impl Report {
             passed: false,
             started: Instant::now(),
             lines,
+            patience,
             busy: BusyWatch::start(),
             lost_in: None,
         };
@@ -111,8 +115,8 @@ impl Report {
 
     /// Performs a step. An error is a failure, and the next step is still tried: unless there is no connection any more, which is one
     /// failure, or Ctrl-C was pressed, or nobody wants the report.
-    pub fn step(&mut self, name: &str, act: impl FnOnce() -> anyhow::Result<Outcome>) {
-        if self.interrupted || interrupt::requested() {
+    pub(super) fn step(&mut self, name: &str, act: impl FnOnce(&Patience) -> anyhow::Result<Outcome>) {
+        if self.interrupted || self.patience.is_over() {
             self.interrupted = true;
             return;
         }
@@ -122,7 +126,7 @@ impl Report {
         self.busy.take_too_busy();
         let outcome = match &self.lost_in {
             Some(step) => Ok(Outcome::Skip(format!("the connection was lost in the step '{step}'"))),
-            None => act(),
+            None => act(&self.patience),
         };
         let outcome = match outcome {
             Err(error) if error.is::<Interrupted>() => {
@@ -136,7 +140,7 @@ impl Report {
                 match self.excuse() {
                     // No advice on what to do with the board.
                     Some(excuse) => Outcome::Fail(format!("{error:#}{excuse}"), Value::Null),
-                    None => Outcome::Fail(cantap_work::advice::sentence(&error), Value::Null),
+                    None => Outcome::Fail(crate::advice::sentence(&error), Value::Null),
                 }
             }
             Ok(Outcome::Fail(says, measured)) => {
@@ -165,8 +169,8 @@ impl Report {
     }
 
     /// Prints the result.
-    pub fn finish(&mut self) {
-        self.seconds = cantap_work::rounded(self.started.elapsed().as_secs_f64(), 1);
+    pub(super) fn finish(&mut self) {
+        self.seconds = crate::rounded(self.started.elapsed().as_secs_f64(), 1);
         self.passed = self.count("FAIL") == 0 && !self.interrupted;
         self.show(&self.tail());
     }
@@ -205,8 +209,8 @@ impl Report {
     }
 
     fn show(&mut self, text: &str) {
-        let Lines::Shown { is_kept } = self.lines else { return };
-        let mut out = io::stdout();
+        let Lines::Shown { out, is_kept } = &mut self.lines else { return };
+        let is_kept = *is_kept;
         if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
             self.lines = Lines::Failed { is_kept, error };
         }
@@ -268,13 +272,13 @@ mod tests {
     fn lines(held_up: Duration, error: impl FnOnce() -> anyhow::Result<Outcome>) -> String {
         let address: Address = "virtual:load=0".parse().unwrap();
         let device = address.open().unwrap();
-        let mut report = Report::new(&address, &device, Lines::Kept);
+        let mut report = Report::new(&address, &device, Lines::Kept, Patience::endless());
         let computer = report.busy.busy_computer();
-        report.step("round trips", || {
+        report.step("round trips", |_| {
             computer(held_up);
             error()
         });
-        report.step("clock", || Ok(Outcome::Pass("steady".to_owned(), Value::Null)));
+        report.step("clock", |_| Ok(Outcome::Pass("steady".to_owned(), Value::Null)));
         report.steps.iter().map(line).collect()
     }
 

@@ -8,10 +8,10 @@ use cantap::wire::record::{ErrorState, TransmitFailure};
 use cantap::{Channel, Device, DeviceError, Frame};
 use serde_json::{Value, json};
 
-use super::patience::{check, pause};
+use super::patience::Patience;
 use super::report::Outcome;
 use super::traffic::{Amount, Flow, STAMP_TOLERANCE_US, exchange, forget, load_together_pct};
-use cantap_work::rounded;
+use crate::rounded;
 
 /// Bit rate of the steps that need only one.
 const BITRATE_BPS: u32 = 500_000;
@@ -44,10 +44,10 @@ fn state(device: &Device, channel: Channel) -> anyhow::Result<ChannelStatus> {
 
 /// Listens, and must not have driven the bus: nothing was sent, and the transmit error counter, which a controller may keep
 /// from earlier, has not increased.
-pub fn listen(device: &Device, channel: Channel) -> Result {
+pub fn listen(patience: &Patience, device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::ListenOnly)?;
     let before = state(device, channel)?;
-    pause(LISTENING)?;
+    patience.pause(LISTENING)?;
     let seen = state(device, channel)?;
     device.close_channel(channel)?;
     let ChannelStatus { frames, bus_errors, tec, rec, transmitted, .. } = seen;
@@ -66,11 +66,12 @@ pub fn listen(device: &Device, channel: Channel) -> Result {
 
 /// A channel in loopback inside the controller; its bus sees nothing. Then it is opened again, and its error counters are
 /// reported.
-pub fn alone(device: &Device, channel: Channel, bitrate_bps: u32) -> Result {
+pub fn alone(patience: &Patience, device: &Device, channel: Channel, bitrate_bps: u32) -> Result {
     let mut records = device.records();
     forget(&mut records);
     open(device, channel, bitrate_bps, Mode::SilentLoopback)?;
-    let flows = exchange(device, &mut records, &[(channel, channel)], bitrate_bps, Amount::Frames(FRAMES))?;
+    let flows =
+        exchange(patience, device, &mut records, &[(channel, channel)], bitrate_bps, Amount::Frames(FRAMES))?;
     open(device, channel, bitrate_bps, Mode::ListenOnly)?;
     let again = state(device, channel)?;
     device.close_channel(channel)?;
@@ -97,7 +98,7 @@ fn is_clean(flow: &Flow) -> bool {
 }
 
 /// Frames for later fill the queue completely; once withdrawn, each is reported.
-pub fn fill_queue(device: &Device, channel: Channel) -> Result {
+pub fn fill_queue(patience: &Patience, device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::SilentLoopback)?;
     let ends = device.transmissions();
     let places = u32::from(device.hello().tx_queue);
@@ -116,7 +117,7 @@ pub fn fill_queue(device: &Device, channel: Channel) -> Result {
     let started = Instant::now();
     let mut told = 0;
     while told < queued && started.elapsed() < PATIENCE {
-        check()?;
+        patience.check()?;
         if let Ok(end) = ends.recv_timeout(GLANCE) {
             told += u32::from(end.result == Err(TransmitFailure::Aborted) && end.tag == told);
         }
@@ -131,7 +132,7 @@ pub fn fill_queue(device: &Device, channel: Channel) -> Result {
 }
 
 /// Both channels send as much as possible: each on its own bus, or both on one.
-pub fn saturate(device: &Device, is_one_bus: bool, time: Duration) -> Result {
+pub fn saturate(patience: &Patience, device: &Device, is_one_bus: bool, time: Duration) -> Result {
     let mut records = device.records();
     forget(&mut records);
     let mode = if is_one_bus { Mode::Normal } else { Mode::SilentLoopback };
@@ -142,7 +143,7 @@ pub fn saturate(device: &Device, is_one_bus: bool, time: Duration) -> Result {
     let ways =
         if is_one_bus { [(first, second), (second, first)] } else { [(first, first), (second, second)] };
     let before = device.status()?;
-    let flows = exchange(device, &mut records, &ways, FULL_RATE_BPS, Amount::For(time))?;
+    let flows = exchange(patience, device, &mut records, &ways, FULL_RATE_BPS, Amount::For(time))?;
     let after = device.status()?;
     let loads: Vec<f64> = flows.iter().map(Flow::load_pct).collect();
     let is_full = if is_one_bus {
@@ -171,7 +172,7 @@ pub fn saturate(device: &Device, is_one_bus: bool, time: Duration) -> Result {
 }
 
 /// Both channels send to each other.
-pub fn cross(device: &Device, bitrate_bps: u32) -> Result {
+pub fn cross(patience: &Patience, device: &Device, bitrate_bps: u32) -> Result {
     let mut records = device.records();
     forget(&mut records);
     for channel in Channel::ALL {
@@ -179,6 +180,7 @@ pub fn cross(device: &Device, bitrate_bps: u32) -> Result {
     }
     let [first, second] = Channel::ALL;
     let flows = exchange(
+        patience,
         device,
         &mut records,
         &[(first, second), (second, first)],
@@ -198,7 +200,7 @@ pub fn cross(device: &Device, bitrate_bps: u32) -> Result {
 
 /// One channel sends while the other only listens: nobody acknowledges, so the frame never ends, and the sender stops counting
 /// at error-passive. Whether it keeps that across Close and Open depends on the controller, and is reported.
-pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
+pub fn unacknowledged(patience: &Patience, device: &Device, sender: Channel) -> Result {
     let listener = if sender == Channel::Can1 { Channel::Can2 } else { Channel::Can1 };
     open(device, listener, BITRATE_BPS, Mode::ListenOnly)?;
     open(device, sender, BITRATE_BPS, Mode::Normal)?;
@@ -206,7 +208,7 @@ pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
     device.send(sender, &[TxFrame { tag: 1, frame: "123#55".parse()?, at_ticks: None }])?;
     let started = Instant::now();
     let seen = loop {
-        check()?;
+        patience.check()?;
         let seen = state(device, sender)?;
         if seen.tec >= UNACKNOWLEDGED_TEC || seen.transmitted != before || started.elapsed() > PATIENCE {
             break seen;

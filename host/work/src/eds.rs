@@ -1,4 +1,4 @@
-//! The sheets of CANopen nodes, as given.
+//! The sheets of CANopen nodes (EDS, DCF, XDD, XDC), as users name them.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -7,6 +7,8 @@ use std::sync::Arc;
 use anyhow::Context;
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
+
+use crate::report::Reporter;
 
 /// A sheet's file and its node.
 #[derive(Clone, Debug)]
@@ -41,8 +43,12 @@ impl SheetPath {
         self.node.map_or_else(|| name.clone(), |node| format!("{node}:{name}"))
     }
 
-    /// Reads the file; what is not understood is reported on standard error, unless `quiet`.
-    pub fn load(&self, quiet: bool) -> anyhow::Result<Sheet> {
+    /// Reads the file. What is not understood in it is reported.
+    ///
+    /// # Errors
+    ///
+    /// It cannot be read, or is no sheet.
+    pub fn load(&self, reporter: &Reporter) -> anyhow::Result<Sheet> {
         let name = self.path.display();
         let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read the sheet {name}"))?;
         let eds = Eds::parse(&bytes);
@@ -50,10 +56,8 @@ impl SheetPath {
             !eds.objects.is_empty(),
             "{name} is not an EDS, DCF, XDD or XDC: there is no object in it; give the file that came with the device"
         );
-        if !quiet {
-            for issue in &eds.issues {
-                eprintln!("cantap: {name}: {issue}");
-            }
+        for issue in &eds.issues {
+            reporter.note(format!("{name}: {issue}"));
         }
         Ok(Sheet { node: self.node.or(eds.node), eds: Arc::new(eds) })
     }

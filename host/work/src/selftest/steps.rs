@@ -8,9 +8,9 @@ use cantap::{Channel, Device};
 use cantap_address::{Address, OpenDevice};
 use serde_json::{Value, json};
 
-use super::patience::{check, pause};
+use super::patience::Patience;
 use super::report::Outcome;
-use cantap_work::rounded;
+use crate::rounded;
 
 /// Number of requests for the device's time.
 const ROUND_TRIPS: usize = 500;
@@ -68,12 +68,12 @@ pub fn usb(address: &Address, hello: &Hello) -> Result {
 }
 
 /// How long answers take.
-pub fn round_trips(device: &Device) -> Result {
+pub fn round_trips(patience: &Patience, device: &Device) -> Result {
     let mut times_us = Vec::with_capacity(ROUND_TRIPS);
     let mut last = device.time()?;
     let mut goes_on = true;
     for _ in 0..ROUND_TRIPS {
-        check()?;
+        patience.check()?;
         let asked = Instant::now();
         let ticks = device.time()?;
         times_us.push(asked.elapsed().as_secs_f64() * 1e6);
@@ -90,12 +90,12 @@ pub fn round_trips(device: &Device) -> Result {
 }
 
 /// How much faster the device's clock runs than this computer's.
-pub fn clock(address: &Address, device: &Device) -> Result {
+pub fn clock(patience: &Patience, address: &Address, device: &Device) -> Result {
     let started = Instant::now();
     let drift = || device.clock().drift_ppm;
     // A first figure from when this computer was busy does not last; that of a bad clock does.
     while drift().is_none_or(|ppm: f64| ppm.abs() > MAX_DRIFT_PPM) && started.elapsed() < CLOCK_PATIENCE {
-        pause(Duration::from_millis(100))?;
+        patience.pause(Duration::from_millis(100))?;
     }
     // A device that is part of this program has no crystal: it is as fast as this computer lets it be.
     let is_bad = |ppm: f64| ppm.abs() > MAX_DRIFT_PPM;
@@ -129,17 +129,18 @@ pub fn compare_saved(before: &[Option<Defaults>], now: &[Option<Defaults>]) -> O
 }
 
 /// Restarts the firmware and waits for it to come back.
-pub fn restart(address: &Address, device: OpenDevice, serial: &str) -> Result {
+pub fn restart(patience: &Patience, address: &Address, device: OpenDevice) -> Result {
+    let serial = device.hello().serial.clone();
     let asked = Instant::now();
     device.reset()?;
     drop(device);
     // The port remains for a moment.
-    pause(Duration::from_millis(500))?;
+    patience.pause(Duration::from_millis(500))?;
     let device = loop {
         match address.open() {
             Ok(device) => break device,
             Err(error) if asked.elapsed() > RESTART_PATIENCE => return Err(error.into()),
-            Err(_) => pause(Duration::from_millis(100))?,
+            Err(_) => patience.pause(Duration::from_millis(100))?,
         }
     };
     let seconds = rounded(asked.elapsed().as_secs_f64(), 1);

@@ -7,9 +7,8 @@ use cantap::transmit::Stream;
 use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord, bits_on_bus};
 use serde_json::{Value, json};
 
-use super::patience::check;
-use cantap_work::interrupt;
-use cantap_work::rounded;
+use super::patience::Patience;
+use crate::rounded;
 
 /// If no frame has ended for this long, sending is stuck.
 const PATIENCE: Duration = Duration::from_secs(3);
@@ -152,6 +151,7 @@ pub fn load_together_pct(flows: &[Flow]) -> f64 {
 /// Sends on each channel of `ways`, and listens where it should be received. The channels are open, and stay
 /// open.
 pub fn exchange(
+    patience: &Patience,
     device: &Device,
     records: &mut Records,
     ways: &[(Channel, Channel)],
@@ -187,7 +187,7 @@ pub fn exchange(
         for (from, _) in ways {
             let go_on = |stream: &mut Stream<'_>| {
                 take(stream, records, &mut flows, &mut moved);
-                moved.elapsed() < PATIENCE && !interrupt::requested()
+                moved.elapsed() < PATIENCE && !patience.is_over()
             };
             if stream.push(*from, numbered(*from, number), None, go_on)?.is_none() {
                 break 'sending;
@@ -196,10 +196,10 @@ pub fn exchange(
         number += 1;
         take(&mut stream, records, &mut flows, &mut moved);
     }
-    check()?;
+    patience.check()?;
     stream.flush()?;
     while stream.under_way() > 0 && moved.elapsed() < PATIENCE {
-        check()?;
+        patience.check()?;
         stream.wait(Duration::from_millis(20))?;
         take(&mut stream, records, &mut flows, &mut moved);
     }

@@ -76,7 +76,7 @@ impl FieldSelection {
     }
 
     /// All of an event's fields, each with its name: `j1939.engine_speed`.
-    pub fn all(event: &Event) -> Vec<(String, &Field)> {
+    pub fn all_fields(event: &Event) -> Vec<(String, &Field)> {
         let named = naming::fields(event).into_iter();
         named.map(|(name, field)| (format!("{}.{name}", event.protocol), field)).collect()
     }

@@ -246,7 +246,7 @@ impl FieldColumns {
     fn push(&mut self, place: u64, event: &Event) {
         let fields = match &mut self.selection {
             Some(selection) => selection.fields(event),
-            None => FieldSelection::all(event),
+            None => FieldSelection::all_fields(event),
         };
         for (name, field) in fields {
             self.common.push(place, event);

@@ -236,7 +236,7 @@ impl Safety {
         let mut event = known.event(record, id);
         event.start_ns = first.time_ns;
         event.frames = 2;
-        event.data = plain.clone();
+        event.data.clone_from(&plain);
         event.frames_lost = std::mem::take(&mut srdo.frames_lost);
         if is_inverse {
             known.content(id, &plain, &mut event);

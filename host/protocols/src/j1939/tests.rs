@@ -395,7 +395,9 @@ fn a_caravans_groups_are_read_once_they_show() {
             .map(|(at, frame)| testing::at(at as f64, frame))
             .collect();
         let (mut reader, mut events) = (crate::Reader::new(crate::Options::default()), Vec::new());
-        records.iter().for_each(|record| reader.push(record, &mut events));
+        for record in &records {
+            reader.push(record, &mut events);
+        }
         reader.finish(&mut events);
         events.iter().map(ToString::to_string).collect::<Vec<_>>()
     };

@@ -1,8 +1,8 @@
 //! CANopen safety (EN 50325-5, once CiA 304): safety-related data objects (SRDO), and the global fail-safe command (GFC).
 //!
 //! An SRDO is two frames: the data on an odd identifier from 101 to 17F, and their bitwise inverse on the next one. A pair of identifiers is
-//! known from a sheet (1301 to 1340), or from pairs that fit ([`PAIRS_ENOUGH`]): until then nothing is said of it, and what came meanwhile is said
-//! when it is known. Identifiers, times and mapping are as in CANopenNode (`304/CO_SRDO.c`, `304/CO_GFC.c`; Apache License 2.0).
+//! known from a sheet (1301 to 1340), or from pairs that fit ([`PAIRS_ENOUGH`]): until then nothing is said of it, and what came meanwhile
+//! is said when it is known. Identifiers, times and mapping are as in CANopenNode (`304/CO_SRDO.c`, `304/CO_GFC.c`; Apache License 2.0).
 
 use std::collections::BTreeMap;
 

@@ -19,6 +19,7 @@ mod board;
 mod can_fd;
 mod canalyst_ii;
 mod cannelloni;
+mod cannelloni_tcp;
 mod driver;
 mod elm327;
 mod engine;

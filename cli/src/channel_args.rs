@@ -34,8 +34,9 @@ pub struct ChannelArgs {
     no_stamps: bool,
 }
 
+/// How to take part in a bus.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum ModeArg {
+pub enum ModeArg {
     /// Send nothing, acknowledge nothing.
     #[value(name = "listen-only", alias = "listen")]
     ListenOnly,
@@ -47,7 +48,8 @@ enum ModeArg {
     SilentLoopback,
 }
 
-fn recovery(text: &str) -> Result<RecoveryOption, String> {
+/// How to leave bus-off.
+pub fn recovery(text: &str) -> Result<RecoveryOption, String> {
     match text {
         "auto" => Ok(RecoveryOption::Auto),
         "manual" => Ok(RecoveryOption::Manual),

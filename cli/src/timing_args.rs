@@ -83,7 +83,8 @@ fn register(text: &str) -> Result<BitTiming, String> {
     bit_timing::from_register(value).map_err(|error| advice::explained(&error))
 }
 
-fn percent(text: &str) -> Result<f64, String> {
+/// A sample point.
+pub fn percent(text: &str) -> Result<f64, String> {
     let value = text.strip_suffix('%').unwrap_or(text).parse::<f64>();
     value
         .ok()

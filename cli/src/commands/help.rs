@@ -55,6 +55,7 @@ const GROUPS: [(&str, &[&str]); 7] = [
             "doctor",
             "list",
             "info",
+            "interface",
             "status",
             "defaults",
             "selftest",
@@ -197,11 +198,18 @@ mod tests {
         let mut names: Vec<_> = shown.map(clap::Command::get_name).collect();
         names.sort_unstable();
         // Those that exist on one system only are listed on all.
-        listed.retain(|name| names.contains(name) || !["bridge", "virtual"].contains(name));
+        listed.retain(|name| names.contains(name) || !["bridge", "interface", "virtual"].contains(name));
         assert_eq!(listed, names);
     }
 
-    /// At every usual width: no line is too long, no example is broken, and no sentence is broken where the source happens to be.
+    /// A command's help on a terminal of this width: of `--help`, or of `-h`.
+    fn rendered(command: &clap::Command, is_long: bool, width: usize) -> String {
+        let mut command = command.clone().term_width(width);
+        if is_long { command.render_long_help() } else { command.render_help() }.to_string()
+    }
+
+    /// At every usual width: no line is too long, none is broken within a word, no example is broken, and no sentence is broken where the source happens
+    /// to be.
     #[test]
     fn help_is_whole_at_80_to_120_columns() {
         let mut wrong = Vec::new();
@@ -218,13 +226,20 @@ mod tests {
             for line in lines.iter().filter(|line| line.starts_with(' ') && line.chars().count() > 80) {
                 wrong.push(format!("{name}: too long for 80 columns: {line:?}"));
             }
-            for width in [80, 90, 100, 110, 120] {
-                let text = command.clone().term_width(width).render_long_help().to_string();
-                // A usage is one word for a shell; it is not wrapped.
-                let long =
-                    text.lines().find(|line| line.chars().count() > width && !line.starts_with("Usage:"));
-                if let Some(line) = long {
-                    wrong.push(format!("{name} at {width}: {line:?}"));
+            for is_long in [false, true] {
+                let whole = rendered(command, is_long, 10_000);
+                let words = |text: &str| text.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
+                for width in [80, 90, 100, 110, 120] {
+                    let text = rendered(command, is_long, width);
+                    // A usage is one word for a shell; it is not wrapped.
+                    let long =
+                        text.lines().find(|line| line.chars().count() > width && !line.starts_with("Usage:"));
+                    if let Some(line) = long {
+                        wrong.push(format!("{name} at {width}: {line:?}"));
+                    }
+                    if words(&text) != words(&whole) {
+                        wrong.push(format!("{name} at {width}: a line is broken within a word"));
+                    }
                 }
             }
         });

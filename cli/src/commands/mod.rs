@@ -24,6 +24,8 @@ pub mod gateway;
 pub mod r#gen;
 pub mod help;
 pub mod info;
+#[cfg(target_os = "linux")]
+pub mod interface;
 pub mod j1939;
 pub mod list;
 pub mod man;
@@ -123,6 +125,9 @@ pub enum Command {
     /// Connect a device's channels with Linux CAN interfaces: SocketCAN.
     #[cfg(target_os = "linux")]
     Bridge(bridge::Args),
+    /// Show a CAN interface of Linux, or set its bit rate and mode.
+    #[cfg(target_os = "linux")]
+    Interface(interface::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
     /// Provide interfaces for Wireshark: `cantap extcap install`.
@@ -212,6 +217,8 @@ impl Command {
             Self::Autobaud(args) => autobaud::run(&args),
             #[cfg(target_os = "linux")]
             Self::Bridge(args) => bridge::run(&args),
+            #[cfg(target_os = "linux")]
+            Self::Interface(args) => interface::run(&args),
             Self::Extcap(args) => extcap::run(*args),
             Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),

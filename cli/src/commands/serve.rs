@@ -35,7 +35,7 @@ use cantap_serve::{Board, BoardError, News, Role, Settings, connect};
 
 #[cfg(unix)]
 use self::doors::numbered;
-use self::doors::{Allowed, Door, TunnelArg, allow, allowed, loopback, tunnel};
+use self::doors::{Allowed, Door, TcpTunnelArg, TunnelArg, allow, allowed, loopback, tcp_tunnel, tunnel};
 use self::other_doors::OtherDoors;
 use self::upkeep::Upkeep;
 use self::way::Way;
@@ -132,6 +132,11 @@ pub struct Args {
     /// others are not taken. Can be repeated. If one of the two is not of this computer, the peer may only listen.
     #[arg(long = "cannelloni", value_name = "[CHANNEL:]ADDR:PORT,PEER:PORT", value_parser = tunnel)]
     tunnels: Vec<TunnelArg>,
+    /// Admit cannelloni's clients over TCP to a channel (without it, 1); default 127.0.0.1:20000. Can be repeated. At an address that other computers can
+    /// reach, clients may only listen.
+    #[arg(long = "cannelloni-tcp", value_name = "[CHANNEL:]ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1",
+          value_parser = tcp_tunnel)]
+    tcp_tunnels: Vec<TcpTunnelArg>,
     /// Write candump's log lines to anyone who connects, for nc and SavvyCAN's log server; default 127.0.0.1:29538.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     lines: Option<String>,
@@ -217,6 +222,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let other_doors = OtherDoors::of(
         [&args.socketcand, &args.gvret, &args.lines, &args.metrics].map(Option::as_deref),
         &args.tunnels,
+        &args.tcp_tunnels,
         addresses.len(),
     )?;
     if let (true, Some(option)) = (args.webs.is_empty(), args.databases.given()) {

@@ -50,7 +50,7 @@ fn of(board: &str, is_adapter: bool, sends: bool, data_bitrate_bps: Option<u32>)
             CanFd { receives: Some(true), sends: false, data_bitrate_bps, source: "the address alone" }
         }
         "gvret" => none("the address, which has no ?data-bitrate"),
-        "cannelloni" => CanFd {
+        "cannelloni" | "cannelloni-tcp" => CanFd {
             receives: Some(true),
             sends,
             data_bitrate_bps,

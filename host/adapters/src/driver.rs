@@ -58,12 +58,14 @@ pub enum OpenError {
         command: String,
     },
     /// The system does not let this program use the interface.
-    #[error("the interface '{address}' cannot be used ({source})")]
+    #[error("the interface '{address}' cannot be used ({source}); {advice}")]
     Interface {
         /// As given.
         address: String,
         /// The system's error.
         source: io::Error,
+        /// What to do.
+        advice: &'static str,
     },
     /// There is no such adapter on USB, or more than one.
     #[error("'{address}' is no single {what}: {there}; name one by its serial number, as in {scheme}:SERIAL")]

@@ -19,6 +19,7 @@ mod board;
 mod can_fd;
 mod canalyst_ii;
 mod cannelloni;
+mod cannelloni_tcp;
 mod driver;
 mod elm327;
 mod engine;
@@ -58,3 +59,8 @@ pub use fd_advice::fd_advice;
 pub use maker_channels::{Maker, MakerChannel, MakerChannels, MakerError, maker_channels};
 pub use place::{BadPlace, Place, can_interfaces, open};
 pub use rows::{Confirmation, ListenOnly, Losses, ROWS, Row, Stamps, row};
+#[cfg(target_os = "linux")]
+pub use socketcan::{
+    CanInterface, InterfaceError, InterfaceSettings, can_interface, restart_can_interface, set_can_interface,
+    take_down_can_interface,
+};

@@ -10,6 +10,7 @@ use cantap_vendor::pcan_basic;
 
 use crate::canalyst_ii::CanalystIi;
 use crate::cannelloni::{self, Cannelloni};
+use crate::cannelloni_tcp::CannelloniTcp;
 use crate::driver::{Driver, OpenError};
 use crate::elm327::{self, Elm327, Family, Ids};
 use crate::engine;
@@ -34,7 +35,7 @@ fn exists(_: &str) -> bool {
 }
 
 /// An adapter's place: `can0`, `socketcan:can0`, `slcan:/dev/ttyACM0@115200`, `usb-can-a:/dev/ttyUSB0`, `gvret:tcp://192.168.4.1`, `pcan:PCAN_USBBUS1`, `kvaser:0`, `elm327:tcp://192.168.0.10`,
-/// `stn:/dev/ttyUSB0`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`, `candump:-`, `pcapng:-`.
+/// `stn:/dev/ttyUSB0`, `socketcand://HOST/can0`, `cannelloni://HOST:PORT`, `cannelloni:tcp://HOST`, `candump:-`, `pcapng:-`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
     text: String,
@@ -55,6 +56,7 @@ enum Kind {
     Kvaser { which: kvaser::Which, options: MakerOptions },
     Socketcand { host: String, interface: String },
     Cannelloni { host: String, listen: u16 },
+    CannelloniTcp { host: String },
     Trace { path: String, format: TraceFormat },
 }
 
@@ -113,7 +115,11 @@ impl Place {
     pub const fn sets_bit_rate(&self) -> bool {
         !matches!(
             self.kind,
-            Kind::Socketcan { .. } | Kind::Socketcand { .. } | Kind::Cannelloni { .. } | Kind::Trace { .. }
+            Kind::Socketcan { .. }
+                | Kind::Socketcand { .. }
+                | Kind::Cannelloni { .. }
+                | Kind::CannelloniTcp { .. }
+                | Kind::Trace { .. }
         )
     }
 
@@ -136,7 +142,7 @@ impl Place {
         let Kind::Socketcan { interface } = &self.kind else { return None };
         Some(format!(
             "{interface} runs at {set} bit/s, not at {bitrate_bps}: leave out -b, or set it, as root: ip link set {interface} down && \
-             ip link set {interface} up type can bitrate {bitrate_bps}"
+             ip link set {interface} up type can bitrate {bitrate_bps} (or: cantap interface {interface} -b {bitrate_bps})"
         ))
     }
 
@@ -200,7 +206,7 @@ impl FromStr for Place {
                     .ok_or_else(|| bad("write socketcand://HOST/INTERFACE, as in socketcand://raspberry/can0"))?
             }
             "cannelloni" => cannelloni_of(rest)
-                .ok_or_else(|| bad("write cannelloni://HOST:PORT, and ?listen=PORT after it if the other end sends to another port here"))?,
+                .ok_or_else(|| bad("write cannelloni://HOST:PORT, and ?listen=PORT after it if the other end sends to another port here; or cannelloni:tcp://HOST:PORT for a tunnel over TCP"))?,
             "candump" | "pcapng" if !rest.is_empty() => {
                 let format = if scheme == "candump" { TraceFormat::Candump } else { TraceFormat::Pcapng };
                 Kind::Trace { path: rest.to_owned(), format }
@@ -320,7 +326,7 @@ fn elm327_of(family: Family, rest: &str) -> Option<Kind> {
 }
 
 fn with_port(host: &str, port: u16) -> Option<String> {
-    if host.is_empty() || host.contains(|letter: char| letter.is_whitespace() || letter == '/') {
+    if host.is_empty() || host.contains(|letter: char| letter.is_whitespace() || "/?".contains(letter)) {
         return None;
     }
     // An IPv6 address has its colons in brackets.
@@ -335,6 +341,9 @@ fn with_port(host: &str, port: u16) -> Option<String> {
 }
 
 fn cannelloni_of(rest: &str) -> Option<Kind> {
+    if let Some(host) = rest.strip_prefix("tcp://") {
+        return Some(Kind::CannelloniTcp { host: with_port(host, cannelloni::PORT)? });
+    }
     let rest = rest.strip_prefix("//")?;
     let (host, listen) = match rest.split_once("?listen=") {
         Some((host, listen)) => (host, Some(listen.parse().ok()?)),
@@ -373,6 +382,7 @@ pub fn open(place: &Place) -> Result<Link, OpenError> {
         Kind::Kvaser { which, options } => Box::new(Kvaser::connect(*which, options.clone(), address)?),
         Kind::Socketcand { host, interface } => Box::new(Socketcand::connect(host, interface, address)?),
         Kind::Cannelloni { host, listen } => Box::new(Cannelloni::connect(host, *listen, address)?),
+        Kind::CannelloniTcp { host } => Box::new(CannelloniTcp::connect(host, address)?),
         Kind::Trace { path, format } => {
             let format = match format {
                 TraceFormat::Candump => Format::Candump,
@@ -460,6 +470,8 @@ mod tests {
             "socketcand://pi:29000/vcan1",
             "cannelloni://pi:20001",
             "cannelloni://pi?listen=4",
+            "cannelloni:tcp://pi",
+            "cannelloni:tcp://[::1]:20001",
             "candump:-",
             "pcapng:/tmp/pipe",
         ] {
@@ -503,6 +515,8 @@ mod tests {
             "socketcand://pi/> < send",
             "cannelloni:pi",
             "cannelloni://pi?listen=x",
+            "cannelloni:tcp://",
+            "cannelloni:tcp://pi?listen=4",
             "candump:",
             "usb:1",
         ] {

@@ -104,7 +104,7 @@ pub struct Row {
 }
 
 /// All kinds.
-pub const ROWS: [Row; 34] = [
+pub const ROWS: [Row; 35] = [
     Row {
         board: "slcan",
         what: "an slcan adapter that answers (Lawicel's protocol)",
@@ -192,17 +192,8 @@ pub const ROWS: [Row; 34] = [
         sets_bit_rate: false,
         limits: None,
     },
-    Row {
-        board: "cannelloni",
-        what: "the other end of a cannelloni tunnel",
-        stamps: Stamps::Arrival,
-        losses: Losses::NotReported,
-        errors: "not reported",
-        confirmation: Confirmation::HandedOver,
-        listen_only: ListenOnly::Elsewhere,
-        sets_bit_rate: false,
-        limits: None,
-    },
+    cannelloni("cannelloni", "the other end of a cannelloni tunnel"),
+    cannelloni("cannelloni-tcp", "the other end of a cannelloni tunnel over TCP"),
     Row {
         board: "trace-pipe",
         what: "a trace that another program writes into a pipe",
@@ -251,6 +242,21 @@ const TOLD_EXTENDED: &str = "it is told to receive extended frames (?ids=standar
 
 /// What the protocol of GVRET does not tell of frames on a bus with CAN FD.
 const FLAGS_BY_ADDRESS: &str = "on a bus with CAN FD neither a frame's flags are reported nor whether one of up to 8 bytes is classical: each is shown as a CAN FD frame that switches its bit rate";
+
+/// A row of the ends of cannelloni's tunnels.
+const fn cannelloni(board: &'static str, what: &'static str) -> Row {
+    Row {
+        board,
+        what,
+        stamps: Stamps::Arrival,
+        losses: Losses::NotReported,
+        errors: "that there was one",
+        confirmation: Confirmation::HandedOver,
+        listen_only: ListenOnly::Elsewhere,
+        sets_bit_rate: false,
+        limits: None,
+    }
+}
 
 /// A row of adapters with the protocol of Waveshare's USB-CAN-A.
 const fn usb_can_a(board: &'static str, limits: &'static str) -> Row {

@@ -60,8 +60,14 @@ impl Socketcand {
         }
         for command in [format!("< open {interface} >"), "< rawmode >".to_owned()] {
             server.line.write(command.as_bytes());
-            if server.answer().map_err(foreign)?.as_deref() != Some("ok") {
-                return Err(OpenError::Refused { address: address.to_owned() });
+            match server.answer().map_err(foreign)?.as_deref() {
+                Some("ok") => {}
+                Some(_) => return Err(OpenError::Refused { address: address.to_owned() }),
+                // It refuses with an error, which is read as one of the bus's; silence is no refusal.
+                None if !server.backlog.is_empty() => {
+                    return Err(OpenError::Refused { address: address.to_owned() });
+                }
+                None => return Err(foreign(String::new())),
             }
         }
         server.backlog.clear();

@@ -1,7 +1,11 @@
-//! cannelloni: CAN frames in UDP datagrams, as its `doc/udp_format.md` and `udpthread.cpp` describe version 2.
+//! cannelloni: CAN frames in UDP datagrams, as its `doc/udp_format.md` and `udpthread.cpp` describe version 2; or over TCP, as its
+//! `doc/tcp_protocol.md` and `decoder.cpp` describe version 1.
 //!
 //! Version, operation 0, a sequence number of eight bits, a count of frames; each frame an identifier as Linux has it, a length, the data unless it
 //! is remote. There is no time in it, UDP may lose or reorder, and nothing says who sent it.
+//!
+//! Over TCP each side begins with the same greeting, and the same frames follow one after the other, with nothing between them: after one that cannot
+//! be, nobody knows where the next begins.
 
 use std::hash::{DefaultHasher, Hasher as _};
 use std::io;
@@ -14,6 +18,9 @@ use cantap_can::{FdFrame, Frame, Id};
 pub const PORT: u16 = 20_000;
 /// The most bytes of a datagram that is sent: what Ethernet carries in one piece.
 pub const MOST_BYTES: usize = 1472;
+
+/// What both sides of a TCP connection send first.
+pub const GREETING: &[u8; 12] = b"CANNELLONIv1";
 
 const VERSION: u8 = 2;
 const DATA: u8 = 0;
@@ -105,6 +112,98 @@ fn id_of(raw: u32) -> Option<Id> {
     if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) }
 }
 
+/// Appends a frame as it is sent.
+pub fn put(frame: &Frame, out: &mut Vec<u8>) {
+    let remote = if frame.is_remote() { REMOTE } else { 0 };
+    begin(raw_of(frame.id()) | remote, frame.dlc().min(8), out);
+    out.extend_from_slice(frame.data());
+}
+
+/// Appends a CAN FD frame as it is sent.
+pub fn put_fd(frame: &FdFrame, out: &mut Vec<u8>) {
+    begin(raw_of(frame.id()), frame.data_len() as u8 | FD, out);
+    out.push(frame.flags());
+    out.extend_from_slice(frame.data());
+}
+
+/// Appends an error frame as it is sent: its classes as an identifier, and its data.
+pub fn put_error(id: u32, data: [u8; 8], out: &mut Vec<u8>) {
+    begin(id | ERROR, 8, out);
+    out.extend_from_slice(&data);
+}
+
+fn raw_of(id: Id) -> u32 {
+    id.raw() | if id.is_extended() { EXTENDED } else { 0 }
+}
+
+fn begin(raw: u32, len: u8, out: &mut Vec<u8>) {
+    out.extend_from_slice(&raw.to_be_bytes());
+    out.push(len);
+}
+
+/// What comes over a TCP connection.
+#[derive(Clone, Debug, Default)]
+pub struct Stream {
+    bytes: Vec<u8>,
+    is_greeted: bool,
+}
+
+/// The other side of a TCP connection does not speak the protocol, or nobody knows any more where its next frame begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BadStream {
+    /// It began with something else than the [`GREETING`].
+    NoGreeting,
+    /// It sent a length or an identifier that no frame has.
+    NoFrame,
+}
+
+impl Stream {
+    /// Takes what has arrived.
+    pub fn push(&mut self, bytes: &[u8]) {
+        self.bytes.extend_from_slice(bytes);
+    }
+
+    /// Whether the whole greeting has come.
+    pub fn is_greeted(&mut self) -> Result<bool, BadStream> {
+        if !self.is_greeted {
+            let len = self.bytes.len().min(GREETING.len());
+            if self.bytes[..len] != GREETING[..len] {
+                return Err(BadStream::NoGreeting);
+            }
+            if len == GREETING.len() {
+                self.bytes.drain(..len);
+                self.is_greeted = true;
+            }
+        }
+        Ok(self.is_greeted)
+    }
+
+    /// The frames that are whole, error frames among them, as far as the first fault.
+    pub fn frames(&mut self, mut take: impl FnMut(Item)) -> Result<(), BadStream> {
+        if !self.is_greeted()? {
+            return Ok(());
+        }
+        let mut rest = &self.bytes[..];
+        let mut fault = Ok(());
+        while let Some((item, after)) = item(rest) {
+            if item == Item::Impossible {
+                fault = Err(BadStream::NoFrame);
+                break;
+            }
+            take(item);
+            rest = after;
+        }
+        let used = self.bytes.len() - rest.len();
+        self.bytes.drain(..used);
+        fault
+    }
+
+    /// Whether a frame has begun that is not whole.
+    pub const fn is_amid_frame(&self) -> bool {
+        self.is_greeted && !self.bytes.is_empty()
+    }
+}
+
 /// What a datagram's number says about those before it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Order {
@@ -162,38 +261,26 @@ pub struct Writer {
 impl Writer {
     /// Adds a frame, for which there must be [room](Self::has_room).
     pub fn push(&mut self, frame: &Frame) {
-        let id = frame.id();
-        let extended = if id.is_extended() { EXTENDED } else { 0 };
-        let remote = if frame.is_remote() { REMOTE } else { 0 };
-        self.put(id.raw() | extended | remote, frame.dlc().min(8), frame.data());
+        put(frame, self.next());
     }
 
     /// Adds a CAN FD frame, for which there must be room.
     pub fn push_fd(&mut self, frame: &FdFrame) {
-        let id = frame.id();
-        let extended = if id.is_extended() { EXTENDED } else { 0 };
-        self.begin(id.raw() | extended, frame.data_len() as u8 | FD);
-        self.bytes.push(frame.flags());
-        self.bytes.extend_from_slice(frame.data());
+        put_fd(frame, self.next());
     }
 
     /// Adds an error frame: its classes as an identifier, the flag included, and its data.
     pub fn push_error(&mut self, id: u32, data: [u8; 8]) {
-        self.put(id | ERROR, 8, &data);
+        put_error(id, data, self.next());
     }
 
-    fn put(&mut self, id: u32, len: u8, data: &[u8]) {
-        self.begin(id, len);
-        self.bytes.extend_from_slice(data);
-    }
-
-    fn begin(&mut self, id: u32, len: u8) {
+    /// Where another frame goes.
+    fn next(&mut self) -> &mut Vec<u8> {
         if self.bytes.is_empty() {
             self.bytes.resize(HEADER, 0);
         }
-        self.bytes.extend_from_slice(&id.to_be_bytes());
-        self.bytes.push(len);
         self.count += 1;
+        &mut self.bytes
     }
 
     /// Whether nothing was added since the last datagram.
@@ -305,6 +392,62 @@ mod tests {
         // A number is used again every 256 datagrams, with the same content if a sender repeats itself.
         for number in (3..=255).chain(0..=255) {
             assert_eq!(take(number, 0), Next);
+        }
+    }
+
+    /// However the bytes are cut: the greeting, then each frame once it is whole, up to one that cannot be.
+    #[test]
+    fn a_stream_is_read_however_it_is_cut() {
+        let frames = ["123#AA", "1ABCDEF0#0102030405060708", "7FF#R4", "00000001#"];
+        let fd = FdFrame::new(Id::extended(0x18DA_F110).unwrap(), true, false, &[0xA5; 64]).unwrap();
+        let mut bytes = GREETING.to_vec();
+        for frame in frames {
+            put(&frame.parse().unwrap(), &mut bytes);
+        }
+        put_fd(&fd, &mut bytes);
+        put_error(4, [1; 8], &mut bytes);
+        let mut wanted: Vec<_> = frames.map(|frame| Item::Frame(frame.parse().unwrap())).into();
+        wanted.extend([Item::Fd(fd), Item::Error]);
+        for piece in [1, 2, 5, 13, 1000] {
+            let (mut stream, mut read) = (Stream::default(), Vec::new());
+            for part in bytes.chunks(piece) {
+                stream.push(part);
+                stream.frames(|item| read.push(item)).unwrap();
+            }
+            assert_eq!(read, wanted, "{piece}");
+            assert!(!stream.is_amid_frame());
+            // Half a frame is waited for; nine bytes of data are no frame, and nothing is read behind them.
+            stream.push(&[0, 0, 1, 0x23, 9, 1]);
+            stream.frames(|item| panic!("{item:?}")).unwrap();
+            assert!(stream.is_amid_frame());
+            stream.push(&[0; 8]);
+            stream.push(&bytes[GREETING.len()..]);
+            assert_eq!(stream.frames(|item| panic!("{item:?}")), Err(BadStream::NoFrame));
+            assert_eq!(stream.frames(|item| panic!("{item:?}")), Err(BadStream::NoFrame));
+        }
+        for other in [&b"SSH-2.0"[..], b"CANNELLONIv2", b"\0"] {
+            let mut stream = Stream::default();
+            stream.push(other);
+            assert_eq!(stream.frames(|item| panic!("{item:?}")), Err(BadStream::NoGreeting));
+        }
+        let mut stream = Stream::default();
+        stream.push(&GREETING[..11]);
+        assert_eq!(stream.is_greeted(), Ok(false));
+    }
+
+    proptest::proptest! {
+        /// Whatever comes, a stream keeps no more than a frame that is not whole.
+        #[test]
+        fn a_stream_keeps_little_of_any_bytes(pieces: Vec<Vec<u8>>) {
+            let mut stream = Stream::default();
+            stream.push(GREETING);
+            for piece in pieces {
+                stream.push(&piece);
+                if stream.frames(|_| {}).is_err() {
+                    break;
+                }
+                proptest::prop_assert!(stream.bytes.len() < 4 + 1 + 1 + 127);
+            }
         }
     }
 

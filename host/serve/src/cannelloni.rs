@@ -1,4 +1,4 @@
-//! A channel in a cannelloni tunnel: UDP datagrams to and from one peer, named when the tunnel is opened.
+//! A channel in a cannelloni tunnel over UDP (over TCP: [`crate::cannelloni_tcp`]): datagrams to and from one peer, named when the tunnel is opened.
 //!
 //! Nothing in a datagram shows who sent it, so the socket is connected: the system takes datagrams from the peer's address and port only, and
 //! whatever arrives, datagrams go nowhere else. What is sent is what is on the bus, never an answer. The bus is only listened to until the peer
@@ -6,27 +6,25 @@
 
 use std::io;
 use std::net::{SocketAddr, UdpSocket};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use cantap::device::is_idle;
-use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_codecs::cannelloni::{Item, NoDatagram, Order, Sequence, Writer, datagram, item, receive};
+use cantap::{TraceEvent, TraceFrame, TraceRecord};
+use cantap_codecs::cannelloni::{NoDatagram, Order, Sequence, Writer, datagram, item, receive};
 use cantap_trace::counted;
 use cantap_wire::Channel;
-use cantap_wire::message::{Mode, Role};
+use cantap_wire::message::Role;
 
 use crate::connect::SOCKET_TIMEOUT;
 use crate::feed::{self, Feed, Losses, Source};
-use crate::left_out::{LOST, LeftOut};
-use crate::lines::device_of;
+use crate::left_out::LOST;
 use crate::listen::Listening;
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
-use crate::own_frames::OwnFrames;
-use crate::text::error_frame;
+use crate::tunnel_bus::{self, Sorted, Told, TunnelBus};
 use crate::{Board, News};
 
 pub use cantap_codecs::cannelloni::PORT;
@@ -63,12 +61,7 @@ pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
     let name = format!("cannelloni peer {peer}");
     let role = if is_local { role } else { Role::Listen };
     let mut end = End {
-        far: Arc::new(Far {
-            socket,
-            own: Mutex::default(),
-            has_gap: AtomicBool::new(false),
-            left_out: Mutex::default(),
-        }),
+        far: Arc::new(Far { socket, bus: TunnelBus::default() }),
         board,
         channel,
         peer,
@@ -86,10 +79,7 @@ pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
 /// The far end, and what is known of it.
 struct Far {
     socket: UdpSocket,
-    own: Mutex<OwnFrames>,
-    /// The tunnel was off the bus for a moment.
-    has_gap: AtomicBool,
-    left_out: Mutex<LeftOut>,
+    bus: TunnelBus,
 }
 
 /// This end of a tunnel.
@@ -152,7 +142,7 @@ impl End {
             Err(error) if is_idle(&error) => {}
             // Nobody listens at the other end yet.
             Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {
-                lock(&self.far.left_out).count(NOBODY, 1);
+                lock(&self.far.bus.left_out).count(NOBODY, 1);
             }
             Err(error) => return Err(error),
         }
@@ -161,9 +151,7 @@ impl End {
     }
 
     fn begin(&self) -> Result<Session, String> {
-        let device = Arc::new(device_of(&self.board, &self.name, self.role)?);
-        let config = device.open_channel(self.channel, None).map_err(|error| error.to_string())?;
-        let source = Source::new(&self.board, &device);
+        let (bus, source) = tunnel_bus::open(&self.board, self.channel, &self.name, self.role)?;
         let is_over = Arc::new(AtomicBool::new(false));
         let feed = TunnelFeed {
             far: Arc::clone(&self.far),
@@ -176,8 +164,6 @@ impl End {
         let thread = std::thread::Builder::new().name("cantap-cannelloni-hears".to_owned());
         let thread = thread.spawn(move || feed.run(source));
         let thread = Some(thread.map_err(|error| error.to_string())?);
-        let sends_in = (self.role >= Role::Send).then_some(Mode::Normal);
-        let bus = OpenBus::new(device, self.channel, config, sends_in, self.board.idle_sender());
         Ok(Session { bus, is_over, thread })
     }
 
@@ -185,7 +171,8 @@ impl End {
     fn take(&mut self, len: usize) {
         match self.frames(len) {
             Ok(frames) => {
-                if let Err(reason) = self.send(&frames) {
+                let bus = self.session.as_mut().map(|session| &mut session.bus);
+                if let Err(reason) = self.far.bus.send(bus, &frames) {
                     self.not_done(reason);
                 }
             }
@@ -212,8 +199,7 @@ impl End {
             Order::Repeated => return Err("a datagram came twice; what it holds was not sent again"),
         };
         let sends_fd = self.session.as_ref().is_none_or(|session| session.bus.device.hello().sends_fd());
-        let mut frames: Vec<TraceFrame> = Vec::new();
-        let (mut errors, mut fd, mut impossible) = (0, 0, 0);
+        let mut sorted = Sorted::default();
         for done in 0..header.count {
             let Some((item, after)) = item(rest) else {
                 faults.push(format!(
@@ -224,13 +210,7 @@ impl End {
                 break;
             };
             rest = after;
-            match item {
-                Item::Frame(frame) => frames.push(frame.into()),
-                Item::Error => errors += 1,
-                Item::Fd(frame) if sends_fd => frames.push(frame.into()),
-                Item::Fd(_) => fd += 1,
-                Item::Impossible => impossible += 1,
-            }
+            sorted.push(item, sends_fd);
         }
         if !rest.is_empty() {
             faults.push(format!(
@@ -238,54 +218,17 @@ impl End {
                 counted(rest.len(), "byte")
             ));
         }
-        for (count, what) in [
-            (errors, "error frames"),
-            (fd, "CAN FD frames, which the board cannot send"),
-            (impossible, "frames that are none"),
-        ] {
-            if count > 0 {
-                faults.push(format!("it sent {count} {what}"));
-            }
-        }
+        faults.extend(sorted.left_out());
         if !faults.is_empty() {
             self.not_done(faults.join("; "));
         }
-        Ok(frames)
-    }
-
-    /// Has frames sent, in their order. What follows one that is refused is not sent either.
-    fn send(&mut self, frames: &[TraceFrame]) -> Result<(), String> {
-        if frames.is_empty() {
-            return Ok(());
-        }
-        let not_sent =
-            |reason: String, count: usize| format!("not sent: {}: {reason}", counted(count, "frame"));
-        let Some(session) = &mut self.session else {
-            return Err(not_sent("the board is not there".to_owned(), frames.len()));
-        };
-        let far = &self.far;
-        if session.bus.sends_in.is_none() {
-            return Err(not_sent("it may only listen".to_owned(), frames.len()));
-        }
-        session
-            .bus
-            .may_send(|| far.has_gap.store(true, Ordering::Relaxed))
-            .map_err(|reason| not_sent(reason, frames.len()))?;
-        for (done, frame) in frames.iter().enumerate() {
-            let tag = session.bus.next_tag();
-            lock(&far.own).sends(tag, *frame);
-            session.bus.send(tag, *frame).map_err(|reason| {
-                lock(&far.own).failed(tag);
-                not_sent(reason, frames.len() - done)
-            })?;
-        }
-        Ok(())
+        Ok(sorted.frames)
     }
 
     fn listen_again(&mut self) {
         let Some(session) = &mut self.session else { return };
         let far = &self.far;
-        match session.bus.listen_again(|| far.has_gap.store(true, Ordering::Relaxed)) {
+        match session.bus.listen_again(|| far.bus.missed()) {
             Ok(None) => {}
             Ok(Some(after)) => {
                 let (client, channel) = (self.name.clone(), self.channel);
@@ -317,37 +260,24 @@ impl TunnelFeed {
     /// Sends it what is on the bus, until the session is over.
     fn run(mut self, source: Source) {
         let untold = feed::run(&mut [source], &mut self);
-        lock(&self.far.left_out).count(LOST, untold);
+        lock(&self.far.bus.left_out).count(LOST, untold);
         self.report_left_out(true);
         self.is_over.store(true, Ordering::Relaxed);
     }
 
     fn report_left_out(&self, is_end: bool) {
-        lock(&self.far.left_out).report(is_end, &self.board, &self.name);
+        lock(&self.far.bus.left_out).report(is_end, &self.board, &self.name);
     }
 
     fn put(&mut self, event: &TraceEvent) {
         if !self.writer.has_room() {
             self.flush();
         }
-        match event {
-            TraceEvent::Frame { frame, direction, .. } => {
-                if *direction == Direction::Tx && lock(&self.far.own).take(*frame) {
-                    return;
-                }
-                match frame {
-                    TraceFrame::Classic(frame) => self.writer.push(frame),
-                    TraceFrame::Fd(frame) => self.writer.push_fd(frame),
-                }
-            }
-            event => {
-                if let TraceEvent::TransmitFailed { tag, .. } = event {
-                    lock(&self.far.own).failed(*tag);
-                }
-                if let Some((id, data)) = error_frame(event) {
-                    self.writer.push_error(id, data);
-                }
-            }
+        match self.far.bus.told(event) {
+            Some(Told::Frame(TraceFrame::Classic(frame))) => self.writer.push(frame),
+            Some(Told::Frame(TraceFrame::Fd(frame))) => self.writer.push_fd(frame),
+            Some(Told::Error(id, data)) => self.writer.push_error(id, data),
+            None => {}
         }
     }
 
@@ -358,13 +288,13 @@ impl TunnelFeed {
         let sent = self.far.socket.send(&bytes).or_else(|error| match error.kind() {
             // That is about an earlier datagram, and this one was not sent.
             io::ErrorKind::ConnectionRefused => {
-                lock(&self.far.left_out).count(NOBODY, 1);
+                lock(&self.far.bus.left_out).count(NOBODY, 1);
                 self.far.socket.send(&bytes)
             }
             _ => Err(error),
         });
         if sent.is_err() {
-            lock(&self.far.left_out).count("frames that could not be sent", count);
+            lock(&self.far.bus.left_out).count("frames that could not be sent", count);
         }
     }
 }
@@ -378,7 +308,7 @@ impl Feed for TunnelFeed {
     fn take(&mut self, _: usize, records: &[TraceRecord]) -> Losses {
         let channel = self.channel.number();
         for record in records.iter().filter(|record| record.channel == channel) {
-            if self.far.has_gap.swap(false, Ordering::Relaxed) {
+            if self.far.bus.take_gap() {
                 self.put(&TraceEvent::GAP);
             }
             self.put(&record.event);

@@ -11,6 +11,7 @@ pub mod beacon;
 mod board;
 mod board_figures;
 pub mod cannelloni;
+pub mod cannelloni_tcp;
 mod client;
 pub mod connect;
 #[cfg(feature = "dns-sd")]
@@ -49,6 +50,7 @@ mod text;
 pub mod tls;
 mod to_send;
 mod totals;
+mod tunnel_bus;
 mod upstream;
 mod writer;
 

@@ -98,17 +98,8 @@ pub struct TunnelArg {
 pub fn tunnel(text: &str) -> Result<TunnelArg, String> {
     const FORM: &str = "write it as CHANNEL:ADDR:PORT,PEER:PORT, as 1:127.0.0.1:20000,127.0.0.1:20001";
     let (local, peer) = text.split_once(',').ok_or(FORM)?;
-    let (number, local) = match local.split_once(':') {
-        Some((number, rest)) if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) => {
-            (number.parse().map_err(|_| FORM)?, rest)
-        }
-        _ => (1, local),
-    };
-    let at = |text: &str| address(text, cannelloni::PORT).map_err(|error| error.to_string());
-    let (local, peer) = (at(local)?, at(peer)?);
-    if number == 0 {
-        return Err("channels are numbered from 1".to_owned());
-    }
+    let (number, local) = channel_before(local, FORM)?;
+    let (local, peer) = (cannelloni_address(local)?, cannelloni_address(peer)?);
     if local.is_ipv4() != peer.is_ipv4() {
         return Err("both addresses must be of one kind, IPv4 or IPv6".to_owned());
     }
@@ -116,6 +107,38 @@ pub fn tunnel(text: &str) -> Result<TunnelArg, String> {
         return Err("a tunnel to itself would send every frame again; name the peer's port".to_owned());
     }
     Ok(TunnelArg { number, local, peer })
+}
+
+/// A channel whose tunnels over TCP begin at an address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TcpTunnelArg {
+    /// The channel's number.
+    pub number: u8,
+    /// Where clients connect.
+    pub address: SocketAddr,
+}
+
+/// Parses `[CHANNEL:]ADDR:PORT`; an address or a port may be left out.
+pub fn tcp_tunnel(text: &str) -> Result<TcpTunnelArg, String> {
+    let (number, address) = channel_before(text, "write it as CHANNEL:ADDR:PORT, as 1:127.0.0.1:20000")?;
+    Ok(TcpTunnelArg { number, address: cannelloni_address(address)? })
+}
+
+/// A channel's number, 1 if there is none, and what stands behind it.
+fn channel_before<'t>(text: &'t str, form: &str) -> Result<(u8, &'t str), String> {
+    match text.split_once(':') {
+        Some((number, rest)) if !number.is_empty() && number.bytes().all(|digit| digit.is_ascii_digit()) => {
+            match number.parse().map_err(|_| form)? {
+                0 => Err("channels are numbered from 1".to_owned()),
+                number => Ok((number, rest)),
+            }
+        }
+        _ => Ok((1, text)),
+    }
+}
+
+fn cannelloni_address(text: &str) -> Result<SocketAddr, String> {
+    address(text, cannelloni::PORT).map_err(|error| error.to_string())
 }
 
 /// An address that can only be reached from this computer.
@@ -208,6 +231,19 @@ mod tests {
             "20000,20001,20002",
         ] {
             assert!(tunnel(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_tunnel_over_tcp_names_a_channel_and_its_beginning() {
+        let parts = |text: &str| tcp_tunnel(text).map(|arg| (arg.number, arg.address.to_string()));
+        let usual = "127.0.0.1:20000".to_owned();
+        assert_eq!(parts("127.0.0.1").unwrap(), (1, usual.clone()));
+        assert_eq!(parts("20000").unwrap(), (1, usual.clone()));
+        assert_eq!(parts("2:127.0.0.1:20000").unwrap(), (2, usual));
+        assert_eq!(parts("2:[::1]:5").unwrap(), (2, "[::1]:5".to_owned()));
+        for wrong in ["", "0:20000", "256:20000", "0.0.0.0:1", "x:20000", "20000,20001"] {
+            assert!(tcp_tunnel(wrong).is_err(), "{wrong}");
         }
     }
 

@@ -8,9 +8,9 @@ use cantap::Channel;
 use cantap::wire::CHANNELS;
 use cantap_serve::cannelloni::{self, Tunnel};
 use cantap_serve::listen::Listening;
-use cantap_serve::{Board, Role, gvret, lines, metrics, socketcand};
+use cantap_serve::{Board, Role, cannelloni_tcp, gvret, lines, metrics, socketcand};
 
-use super::doors::{Allowed, Door, TunnelArg, address, allow, loopback};
+use super::doors::{Allowed, Door, TcpTunnelArg, TunnelArg, address, allow, loopback};
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -24,6 +24,7 @@ pub struct OtherDoors {
     socketcand: Option<SocketAddr>,
     gvret: Option<SocketAddr>,
     tunnels: Vec<TunnelArg>,
+    tcp_tunnels: Vec<TcpTunnelArg>,
     lines: Option<SocketAddr>,
     metrics: Option<SocketAddr>,
 }
@@ -33,19 +34,20 @@ impl OtherDoors {
     pub fn of(
         [socketcand, gvret, lines, metrics]: [Option<&str>; 4],
         tunnels: &[TunnelArg],
+        tcp_tunnels: &[TcpTunnelArg],
         boards: usize,
     ) -> anyhow::Result<Self> {
         let most = boards * CHANNELS;
-        if let Some(tunnel) = tunnels.iter().find(|tunnel| usize::from(tunnel.number) > most) {
-            return Err(usage(format!(
-                "--cannelloni: there is no channel {}, only 1 to {most}",
-                tunnel.number
-            )));
+        let numbers = tunnels.iter().map(|tunnel| ("--cannelloni", tunnel.number));
+        let mut numbers = numbers.chain(tcp_tunnels.iter().map(|tunnel| ("--cannelloni-tcp", tunnel.number)));
+        if let Some((option, number)) = numbers.find(|(_, number)| usize::from(*number) > most) {
+            return Err(usage(format!("{option}: there is no channel {number}, only 1 to {most}")));
         }
         Ok(Self {
             socketcand: socketcand.map(|text| address(text, socketcand::PORT)).transpose()?,
             gvret: gvret.map(|text| address(text, gvret::PORT)).transpose()?,
             tunnels: tunnels.to_vec(),
+            tcp_tunnels: tcp_tunnels.to_vec(),
             lines: lines.map(|text| loopback(text, LINES_PORT)).transpose()?,
             metrics: metrics.map(|text| address(text, METRICS_PORT)).transpose()?,
         })
@@ -103,6 +105,17 @@ impl OtherDoors {
                 ));
             }
             ways.push((format!("cannelloni://{local}?listen={}", peer.port()), way));
+        }
+        for TcpTunnelArg { number, address } in &self.tcp_tunnels {
+            let at = usize::from(*number) - 1;
+            let (board, channel) = (&boards[at / CHANNELS], Channel::ALL[at % CHANNELS]);
+            let role = allow(all, Door::Cannelloni);
+            let way = cannelloni_tcp::listen(board, channel, *address, role).with_context(|| {
+                format!("nobody can listen at {address}; give another port with --cannelloni-tcp")
+            })?;
+            let address = way.address().unwrap_or(*address);
+            say_who_may_send(all, Door::Cannelloni, "cannelloni", address);
+            ways.push((format!("cannelloni:tcp://{address}"), way));
         }
         if let Some(address) = self.lines {
             let way = lines::listen(boards, address)

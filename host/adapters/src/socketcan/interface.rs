@@ -1,4 +1,4 @@
-//! What the driver needs of the system.
+//! What is needed of the system: by the driver, and to set an interface up.
 
 use std::io;
 use std::time::Duration;
@@ -21,4 +21,14 @@ pub(super) trait Interface: Send {
     fn send_fd(&mut self, frame: &RawFdFrame) -> io::Result<()>;
     /// How many messages the socket has dropped, if the kernel says so.
     fn dropped(&mut self) -> Option<u32>;
+}
+
+/// The kernel, where an interface is set up: another one in tests.
+pub(super) trait Kernel {
+    /// What it says about the interface.
+    fn look(&mut self) -> io::Result<Link>;
+    /// Asks for a change, and waits for the answer.
+    fn change(&mut self, message: &[u8]) -> io::Result<()>;
+    /// Through which of its protocols programs receive from the interface.
+    fn receivers(&self) -> Vec<String>;
 }

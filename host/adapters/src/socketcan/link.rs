@@ -7,16 +7,16 @@ use cantap_wire::record::ErrorState;
 /// `ARPHRD_CAN` of `linux/if_arp.h`.
 const ARPHRD_CAN: u16 = 280;
 /// Flags of an interface (`linux/if.h`).
-const IFF_UP: u32 = 1;
+pub(super) const IFF_UP: u32 = 1;
 const IFF_ECHO: u32 = 1 << 18;
 
 // Messages and flags of `linux/netlink.h` and `linux/rtnetlink.h`.
-const NLMSG_ERROR: u16 = 2;
-const RTM_NEWLINK: u16 = 16;
+pub(super) const NLMSG_ERROR: u16 = 2;
+pub(super) const RTM_NEWLINK: u16 = 16;
 const RTM_GETLINK: u16 = 18;
-const NLM_F_REQUEST: u16 = 1;
+pub(super) const NLM_F_REQUEST: u16 = 1;
 /// Bytes of a message's header, and of `struct ifinfomsg` after it.
-const HEADER: usize = 16;
+pub(super) const HEADER: usize = 16;
 const INFO: usize = 16;
 /// Bytes of a CAN FD frame: an interface that takes them has at least this MTU (`linux/can.h`).
 const CANFD_MTU: u32 = 72;
@@ -25,17 +25,20 @@ const TYPE_MASK: u16 = 0x3FFF;
 
 const IFLA_IFNAME: u16 = 3;
 const IFLA_MTU: u16 = 4;
-const IFLA_LINKINFO: u16 = 18;
+pub(super) const IFLA_LINKINFO: u16 = 18;
 const IFLA_STATS64: u16 = 23;
-const IFLA_INFO_KIND: u16 = 1;
-const IFLA_INFO_DATA: u16 = 2;
-const IFLA_CAN_BITTIMING: u16 = 1;
+pub(super) const IFLA_INFO_KIND: u16 = 1;
+pub(super) const IFLA_INFO_DATA: u16 = 2;
+pub(super) const IFLA_CAN_BITTIMING: u16 = 1;
 const IFLA_CAN_STATE: u16 = 4;
-const IFLA_CAN_CTRLMODE: u16 = 5;
+pub(super) const IFLA_CAN_CTRLMODE: u16 = 5;
+pub(super) const IFLA_CAN_RESTART_MS: u16 = 6;
+pub(super) const IFLA_CAN_RESTART: u16 = 7;
 const IFLA_CAN_BERR_COUNTER: u16 = 8;
-const IFLA_CAN_DATA_BITTIMING: u16 = 9;
-const CAN_CTRLMODE_LISTENONLY: u32 = 2;
-const CAN_CTRLMODE_FD: u32 = 0x20;
+pub(super) const IFLA_CAN_DATA_BITTIMING: u16 = 9;
+pub(super) const CAN_CTRLMODE_LOOPBACK: u32 = 1;
+pub(super) const CAN_CTRLMODE_LISTENONLY: u32 = 2;
+pub(super) const CAN_CTRLMODE_FD: u32 = 0x20;
 
 /// Places in `struct rtnl_link_stats64`, in 64-bit numbers.
 const RX_DROPPED: usize = 6;
@@ -68,23 +71,53 @@ pub(crate) struct Link {
     pub overruns: u64,
     /// Frames that the driver or the kernel has dropped on the way to all programs.
     pub dropped: u64,
+    pub set_up: SetUp,
+}
+
+/// `struct can_bittiming` of `linux/can/netlink.h`: bit rate, sample point in thousandths, the quantum in ns, three segments, jump width, prescaler.
+pub(crate) type Timing = [u32; 8];
+
+/// How an interface is set up, in the kernel's own terms: what it takes to put that back.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct SetUp {
+    /// The kernel's number of the interface.
+    pub index: u32,
+    /// Zeros if it was never set.
+    pub timing: Timing,
+    /// Of data phases; zeros if it was never set.
+    pub data_timing: Timing,
+    /// `CAN_CTRLMODE_`…
+    pub mode: u32,
+    /// Milliseconds from bus-off to a restart; 0 if there is none.
+    pub restart_ms: u32,
+}
+
+/// A message about an interface: `struct ifinfomsg` with number, flags and which of them are meant; and attributes.
+pub(super) fn message(kind: u16, flags: u16, info: [u32; 3], attributes: &[u8]) -> Vec<u8> {
+    let mut bytes = Vec::with_capacity(HEADER + INFO + attributes.len());
+    bytes.extend_from_slice(&((HEADER + INFO + attributes.len()) as u32).to_ne_bytes());
+    bytes.extend_from_slice(&kind.to_ne_bytes());
+    bytes.extend_from_slice(&flags.to_ne_bytes());
+    // The message's number and its sender's port, and what is left open of the kind of the interface.
+    bytes.extend_from_slice(&[0; 8 + 4]);
+    bytes.extend(info.into_iter().flat_map(u32::to_ne_bytes));
+    bytes.extend_from_slice(attributes);
+    bytes
+}
+
+/// An attribute: length, type, content, padded to four bytes.
+pub(super) fn attribute(kind: u16, content: &[u8]) -> Vec<u8> {
+    let mut bytes = ((4 + content.len()) as u16).to_ne_bytes().to_vec();
+    bytes.extend_from_slice(&kind.to_ne_bytes());
+    bytes.extend_from_slice(content);
+    bytes.resize(bytes.len().next_multiple_of(4), 0);
+    bytes
 }
 
 /// The request for an interface of this name.
 pub(crate) fn request(name: &str) -> Vec<u8> {
-    let attribute = 4 + name.len() + 1;
-    let padded = attribute.next_multiple_of(4);
-    let mut bytes = Vec::with_capacity(HEADER + INFO + padded);
-    bytes.extend_from_slice(&((HEADER + INFO + padded) as u32).to_ne_bytes());
-    bytes.extend_from_slice(&RTM_GETLINK.to_ne_bytes());
-    bytes.extend_from_slice(&NLM_F_REQUEST.to_ne_bytes());
-    // The number and the port of the sender, and `struct ifinfomsg`.
-    bytes.extend_from_slice(&[0; 8 + INFO]);
-    bytes.extend_from_slice(&(attribute as u16).to_ne_bytes());
-    bytes.extend_from_slice(&IFLA_IFNAME.to_ne_bytes());
-    bytes.extend_from_slice(name.as_bytes());
-    bytes.resize(HEADER + INFO + padded, 0);
-    bytes
+    let name = attribute(IFLA_IFNAME, &[name.as_bytes(), &[0]].concat());
+    message(RTM_GETLINK, NLM_F_REQUEST, [0; 3], &name)
 }
 
 /// The answer. An error is the kernel's (ENODEV: there is no such interface), or that the bytes are no answer.
@@ -106,6 +139,7 @@ fn parse(bytes: &[u8]) -> Option<io::Result<Link>> {
                 is_can: u16_at(message, 2)? == ARPHRD_CAN,
                 is_up: flags & IFF_UP != 0,
                 echoes: flags & IFF_ECHO != 0,
+                set_up: SetUp { index: u32_at(message, 4)?, ..SetUp::default() },
                 ..Link::default()
             };
             for (kind, content) in Attributes(message.get(INFO..)?) {
@@ -143,11 +177,19 @@ impl Link {
 
     fn controller(&mut self, bytes: &[u8]) {
         let rate = |content| u32_at(content, 0).filter(|rate| (1..u32::MAX).contains(rate));
+        let timing = |content| std::array::from_fn(|at| u32_at(content, 4 * at).unwrap_or(0));
         let (mut data_bitrate_bps, mut has_fd) = (None, false);
         for (kind, content) in Attributes(bytes) {
             match kind {
-                IFLA_CAN_BITTIMING => self.bitrate_bps = rate(content),
-                IFLA_CAN_DATA_BITTIMING => data_bitrate_bps = rate(content),
+                IFLA_CAN_BITTIMING => {
+                    self.bitrate_bps = rate(content);
+                    self.set_up.timing = timing(content);
+                }
+                IFLA_CAN_DATA_BITTIMING => {
+                    data_bitrate_bps = rate(content);
+                    self.set_up.data_timing = timing(content);
+                }
+                IFLA_CAN_RESTART_MS => self.set_up.restart_ms = u32_at(content, 0).unwrap_or(0),
                 IFLA_CAN_STATE => {
                     self.state = match u32_at(content, 0) {
                         Some(0) => Some(ErrorState::Active),
@@ -162,6 +204,7 @@ impl Link {
                     let flags = u32_at(content, 4).unwrap_or(0);
                     self.listen_only = flags & CAN_CTRLMODE_LISTENONLY != 0;
                     has_fd = flags & CAN_CTRLMODE_FD != 0;
+                    self.set_up.mode = flags;
                 }
                 IFLA_CAN_BERR_COUNTER => {
                     let counter = |at| u16_at(content, at).map(|count| count.min(255) as u8);
@@ -189,11 +232,11 @@ impl<'b> Iterator for Attributes<'b> {
     }
 }
 
-fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
+pub(super) fn u16_at(bytes: &[u8], at: usize) -> Option<u16> {
     bytes.get(at..)?.first_chunk().map(|bytes| u16::from_ne_bytes(*bytes))
 }
 
-fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
+pub(super) fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
     bytes.get(at..)?.first_chunk().map(|bytes| u32::from_ne_bytes(*bytes))
 }
 
@@ -205,15 +248,8 @@ fn u64_at(bytes: &[u8], index: usize) -> Option<u64> {
 mod tests {
     use super::*;
 
-    fn attribute(kind: u16, content: &[u8]) -> Vec<u8> {
-        let mut bytes = ((4 + content.len()) as u16).to_ne_bytes().to_vec();
-        bytes.extend_from_slice(&kind.to_ne_bytes());
-        bytes.extend_from_slice(content);
-        bytes.resize(bytes.len().next_multiple_of(4), 0);
-        bytes
-    }
-
-    fn message(kind: u16, content: &[u8]) -> Vec<u8> {
+    /// A message with any content.
+    fn raw(kind: u16, content: &[u8]) -> Vec<u8> {
         let mut bytes = ((HEADER + content.len()) as u32).to_ne_bytes().to_vec();
         bytes.extend_from_slice(&kind.to_ne_bytes());
         bytes.extend_from_slice(&[0; 10]);
@@ -231,7 +267,7 @@ mod tests {
         content.extend_from_slice(&ARPHRD_CAN.to_ne_bytes());
         content.extend_from_slice(&words(&[7, flags, 0]));
         content.extend(attributes.concat());
-        message(RTM_NEWLINK, &content)
+        raw(RTM_NEWLINK, &content)
     }
 
     /// A controller's interface that only listens, with everything that `ip -details -statistics link` prints.
@@ -249,6 +285,7 @@ mod tests {
                 attribute(IFLA_CAN_CTRLMODE, &words(&[0, CAN_CTRLMODE_LISTENONLY | 0x10 | fd])),
                 attribute(IFLA_CAN_DATA_BITTIMING, &words(&[2_000_000, 750, 25, 7, 7, 5, 1, 1])),
                 attribute(IFLA_CAN_STATE, &words(&[2])),
+                attribute(IFLA_CAN_RESTART_MS, &words(&[100])),
                 attribute(IFLA_CAN_BERR_COUNTER, &counters),
             ],
         );
@@ -280,25 +317,34 @@ mod tests {
             counters: Some((130, 255)),
             overruns: 8,
             dropped: 5,
+            set_up: SetUp {
+                index: 7,
+                timing: [500_000, 875, 125, 6, 7, 2, 1, 6],
+                data_timing: [2_000_000, 750, 25, 7, 7, 5, 1, 1],
+                mode: 0x32,
+                restart_ms: 100,
+            },
         };
         assert_eq!(read, wanted);
         // A data bit rate that was set once says nothing while CAN FD is off.
         let classical = answer(&controller(0)).unwrap();
-        assert_eq!(classical, Link { data_bitrate_bps: None, takes_fd: false, ..wanted });
+        let set_up = SetUp { mode: 0x12, ..wanted.set_up };
+        assert_eq!(classical, Link { data_bitrate_bps: None, takes_fd: false, set_up, ..wanted });
     }
 
     #[test]
     fn a_virtual_interface_has_neither_rate_nor_state() {
         let kind = attribute(IFLA_INFO_KIND, b"vcan\0");
         let read = answer(&link(0, &[attribute(IFLA_LINKINFO, &kind)])).unwrap();
-        let wanted = Link { is_can: true, kind: "vcan".to_owned(), ..Link::default() };
+        let set_up = SetUp { index: 7, ..SetUp::default() };
+        let wanted = Link { is_can: true, kind: "vcan".to_owned(), set_up, ..Link::default() };
         assert_eq!(read, wanted);
     }
 
     #[test]
     fn an_interface_that_is_not_there_is_the_kernel_s_error() {
         const ENODEV: i32 = 19;
-        let error = answer(&message(NLMSG_ERROR, &(-ENODEV).to_ne_bytes())).unwrap_err();
+        let error = answer(&raw(NLMSG_ERROR, &(-ENODEV).to_ne_bytes())).unwrap_err();
         assert_eq!(error.raw_os_error(), Some(ENODEV));
     }
 

@@ -1,11 +1,14 @@
 //! CAN interfaces of Linux: `can0`, `socketcan:can0`.
 //!
-//! The interface belongs to its owner: bit rate, mode and state are read (rtnetlink), never set. What is lost is counted where it is: by the
+//! The interface belongs to its owner: whoever opens it reads bit rate, mode and state (rtnetlink), and sets nothing. To set them is a request of its
+//! own ([`set_can_interface`]). What is lost is counted where it is: by the
 //! controller and its driver, by the kernel on the way to this program, and by the socket.
 
+mod configure;
 mod content;
 mod interface;
 mod link;
+mod link_change;
 mod linux;
 
 use std::collections::VecDeque;
@@ -16,12 +19,14 @@ use cantap_trace::TraceFrame;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_wire::record::{ErrorState, LossStage};
 use cantap_wire::{Channel, FdFrame, Frame, Refusal};
-use nix::libc::{EAGAIN, EINTR, ENETDOWN, ENOBUFS, ENODEV, ENXIO};
+use nix::libc::{
+    EACCES, EAFNOSUPPORT, EAGAIN, EINTR, ENETDOWN, ENOBUFS, ENODEV, ENXIO, EPERM, EPROTONOSUPPORT,
+};
 
 use self::content::{Content, content};
 use self::interface::Interface;
 use self::link::Link;
-use self::linux::LinuxInterface;
+use self::linux::{LinuxInterface, there};
 use crate::adapter_clock::AdapterClock;
 use crate::driver::{At, Driver, Incoming, Oddities, OpenError, Opening};
 use crate::error_frames::ErrorFrames;
@@ -30,6 +35,10 @@ use crate::raw_can::{BATCH, Message, raw_fd_frame, raw_frame};
 use crate::rows::{Row, row};
 use crate::under_way::are_alike;
 
+pub use self::configure::{
+    CanInterface, InterfaceError, InterfaceSettings, can_interface, restart_can_interface, set_can_interface,
+    take_down_can_interface,
+};
 pub(crate) use self::linux::{exists, interfaces};
 
 /// How often the kernel's figures are read.
@@ -88,7 +97,10 @@ impl SocketCan {
     pub fn connect(name: &str, address: &str) -> Result<Self, OpenError> {
         let interface = LinuxInterface::new(name);
         let has_hardware_stamps = interface.has_hardware_stamps();
-        Self::over(Box::new(interface), has_hardware_stamps, name, address)
+        let is_known = has_hardware_stamps.as_ref().is_ok_and(|has| *has);
+        let driver = Self::over(Box::new(interface), is_known, name, address)?;
+        // What the interface itself lacks is said first.
+        has_hardware_stamps.map(|_| driver).map_err(|source| unusable(address, source))
     }
 
     fn over(
@@ -100,22 +112,15 @@ impl SocketCan {
         let link = match interface.look() {
             Ok(link) if link.is_can => link,
             Err(error) if error.raw_os_error() != Some(ENODEV) => {
-                return Err(OpenError::Interface { address: address.to_owned(), source: error });
+                return Err(unusable(address, error));
             }
             _ => {
-                let there = match interfaces() {
-                    there if there.is_empty() => {
-                        "there is none here (as root, for a virtual one: ip link add vcan0 type vcan && ip link set vcan0 up)"
-                            .to_owned()
-                    }
-                    there => format!("there are {}", there.join(", ")),
-                };
-                return Err(OpenError::NoInterface { address: address.to_owned(), there });
+                return Err(OpenError::NoInterface { address: address.to_owned(), there: there() });
             }
         };
         if !link.is_up {
             let rate = if link.kind == "can" && link.bitrate_bps.is_none() {
-                " type can bitrate 500000"
+                " type can bitrate 500000, with the bus's bit rate"
             } else {
                 ""
             };
@@ -309,7 +314,9 @@ impl SocketCan {
         }
         let reason = match code {
             Some(ENETDOWN) => format!("the interface {name} was taken down; as root: ip link set {name} up"),
-            Some(ENODEV | ENXIO) => format!("the interface {name} is gone"),
+            Some(ENODEV | ENXIO) => format!(
+                "the interface {name} is gone, and has to be set up again once it is back: cantap interface {name} -b RATE"
+            ),
             _ => format!("the interface {name} fails: {error}"),
         };
         self.ended.get_or_insert(reason);
@@ -337,6 +344,20 @@ impl SocketCan {
             self.look();
         }
     }
+}
+
+/// The kernel gives no socket for the interface.
+fn unusable(address: &str, source: io::Error) -> OpenError {
+    let advice = match source.raw_os_error() {
+        Some(EAFNOSUPPORT | EPROTONOSUPPORT) => {
+            "this kernel has no sockets for CAN; as root: modprobe can-raw"
+        }
+        Some(EPERM | EACCES) => {
+            "a container or a sandbox forbids it; it needs the host's network (docker run --network host), or run this outside"
+        }
+        _ => "the kernel's log (dmesg) may say more",
+    };
+    OpenError::Interface { address: address.to_owned(), source, advice }
 }
 
 /// What can be told of an interface.

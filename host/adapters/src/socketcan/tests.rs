@@ -345,6 +345,19 @@ fn an_interface_that_is_down_or_no_can_interface_is_not_opened() {
     assert!(matches!(other, OpenError::NoInterface { .. }), "{other}");
 }
 
+/// A container, a kernel without CAN: each says what to do.
+#[test]
+fn an_interface_that_the_system_does_not_give_says_what_to_do() {
+    for (code, words) in [
+        (EAFNOSUPPORT, "modprobe can-raw"),
+        (EPERM, "a container or a sandbox forbids it"),
+        (nix::libc::EIO, "dmesg"),
+    ] {
+        let error = unusable("can0", io::Error::from_raw_os_error(code)).to_string();
+        assert!(error.contains(words) && error.contains("'can0'"), "{error}");
+    }
+}
+
 #[test]
 fn a_frame_s_time_is_the_driver_s_and_the_interval_of_two_is_the_controller_s() {
     let (fake, mut driver) = opened(controller());

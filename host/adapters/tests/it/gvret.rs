@@ -278,12 +278,15 @@ fn one_that_says_something_else_without_an_end_is_not_waited_for() {
     babbler.join().unwrap();
 }
 
-/// The same on a serial port: set to listen, heard, and pulled out.
+/// An adapter on a serial port, which answers nothing any more once it stalls.
 #[cfg(unix)]
-#[test]
-fn on_a_serial_port_it_is_the_same() {
+fn on_a_port(stalls: &std::sync::Arc<std::sync::atomic::AtomicBool>) -> crate::port::Port {
+    let stalls = std::sync::Arc::clone(stalls);
     let (mut bytes, mut buses) = (Vec::<u8>::new(), [0; 2]);
-    let port = crate::port::Port::start(move |byte| {
+    crate::port::Port::start(move |byte| {
+        if stalls.load(std::sync::atomic::Ordering::Relaxed) {
+            return Vec::new();
+        }
         bytes.push(byte);
         let &[0xF1, command, ref rest @ ..] = &bytes[..] else {
             if bytes != [0xF1] {
@@ -299,12 +302,74 @@ fn on_a_serial_port_it_is_the_same() {
         }
         bytes.clear();
         answer(command, buses, true).unwrap_or_default()
-    });
+    })
+}
+
+/// The same on a serial port: set to listen, heard, and pulled out.
+#[cfg(unix)]
+#[test]
+fn on_a_serial_port_it_is_the_same() {
+    let port = on_a_port(&std::sync::Arc::default());
     let device = open(&format!("gvret:{}", port.path));
     device.listen(Channel::Can1, 500_000).unwrap();
     port.says(received(1000, 0x123, 0, &[0xAA]));
     until_frame(&device, "123#AA");
+    // Half a frame, and babbling behind it.
+    port.says(
+        [&received(2000, 0x124, 0, &[0xBB; 8])[..9], &[0xC8; 4096], &received(3000, 0x7FF, 0, &[])].concat(),
+    );
+    let records = until_frame(&device, "7FF#");
+    assert_eq!(frames(&records), ["7FF#"]);
+    assert!((1..100).contains(&losses(&records).len()), "{:?}", losses(&records));
     port.pull();
     let end = device.records().find_map(Result::err).unwrap();
     assert!(matches!(end, DeviceError::Vanished { .. }), "{end}");
+}
+
+/// Whether its channel is being opened or is open.
+#[cfg(unix)]
+#[test]
+fn one_that_stalls_is_refused_or_waited_for_and_holds_up_nothing() {
+    for options in ["", "?data-bitrate=2M"] {
+        let stalls = std::sync::Arc::default();
+        let port = on_a_port(&stalls);
+        let device = open(&format!("gvret:{}{options}", port.path));
+        stalls.store(true, std::sync::atomic::Ordering::Relaxed);
+        let refused = device.listen(Channel::Can1, 500_000).unwrap_err();
+        assert!(matches!(refused, DeviceError::Refused { refusal: Refusal::Hardware }), "{refused}");
+        device.status().unwrap();
+        stalls.store(false, std::sync::atomic::Ordering::Relaxed);
+        device.listen(Channel::Can1, 500_000).unwrap();
+        stalls.store(true, std::sync::atomic::Ordering::Relaxed);
+        // The rest of a frame comes late, and is that frame.
+        let frame = received(1000, 0x123, 0, &[0xAA; 4]);
+        port.says(&frame[..8]);
+        device.status().unwrap();
+        port.says(&frame[8..]);
+        assert_eq!(frames(&until_frame(&device, "123#AAAAAAAA")), ["123#AAAAAAAA"]);
+        // It does not answer when it is closed either.
+        device.stop().unwrap();
+    }
+}
+
+/// With a data bit rate, too, and while its channel is open.
+#[test]
+fn babbling_of_one_with_can_fd_is_losses_and_holds_up_nothing() {
+    let (address, streams, _seen) = start(true);
+    let device = open(&format!("{address}?data-bitrate=2M"));
+    let mut adapter = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    let mut number = 1u32;
+    let babble = std::iter::repeat_with(|| {
+        number = number.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        (number >> 24) as u8 & 0x7F
+    });
+    adapter.write_all(&babble.take(1 << 20).collect::<Vec<_>>()).unwrap();
+    // What hides in it ends before this.
+    adapter.write_all(&[0; 200]).unwrap();
+    adapter.write_all(&received(1000, 0x7FF, 0, &[0xA5])).unwrap();
+    let records = until_frame(&device, "7FF#A5");
+    assert_eq!(frames(&records), ["7FF#A5"]);
+    assert!((1..1000).contains(&losses(&records).len()), "{}", losses(&records).len());
+    assert!(device.failures().unwrap().last.contains("bytes that are no message"));
 }

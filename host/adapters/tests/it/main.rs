@@ -1,6 +1,7 @@
 //! Adapters as devices, against stand-ins that follow foreign sources.
 
 mod cannelloni;
+mod cannelloni_tcp;
 #[cfg(unix)]
 mod elm327;
 mod gvret;

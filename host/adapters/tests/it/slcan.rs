@@ -160,6 +160,33 @@ fn a_silent_dialect_is_known_by_its_version_and_listens_by_mode() {
     assert_eq!(last, ["S8", "M1", "O"]);
 }
 
+/// It says nothing to what it is told, so a frame is handed over and no more; what comes and goes is as with the others.
+#[test]
+fn a_silent_dialect_sends_babbles_and_is_pulled_out_as_others_do() {
+    let adapter = StandIn::start(Manner::Canable);
+    let device = open(&adapter.address());
+    device.join(Channel::Can1, 500_000).unwrap();
+    assert_eq!(send(&device, "1ABCDEF0#22").result.unwrap().to_string(), "1ABCDEF0#22");
+    let commands = adapter.commands();
+    assert!(
+        commands.contains(&"M0".to_owned()) && commands.contains(&"T1ABCDEF0122".to_owned()),
+        "{commands:?}"
+    );
+    for _ in 0..256 {
+        adapter.says(&"x".repeat(1024));
+    }
+    // Half a line, whose end comes later.
+    adapter.says("\rt12");
+    device.status().unwrap();
+    adapter.says("31AA\r");
+    let records = until_frame(&device, "123#AA");
+    assert_eq!(frames(&records).last().unwrap(), "123#AA");
+    assert!((1..100).contains(&losses(&records).len()), "{}", losses(&records).len());
+    adapter.pull();
+    let end = device.records().find_map(Result::err).unwrap();
+    assert!(matches!(end, DeviceError::Vanished { .. }), "{end}");
+}
+
 #[test]
 fn a_sent_frame_is_confirmed_when_the_adapter_has_accepted_it_even_if_it_refused_it_at_first() {
     let adapter = StandIn::start(Manner::Full);

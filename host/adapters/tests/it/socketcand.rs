@@ -96,3 +96,37 @@ fn an_interface_that_is_not_there_is_refused() {
     let place: cantap_adapters::Place = format!("socketcand://{place}/can7").parse().unwrap();
     assert!(matches!(cantap_adapters::open(&place), Err(OpenError::Refused { .. })));
 }
+
+/// Silence at each step is no refusal, and is not waited for without an end.
+#[test]
+fn one_that_stalls_while_it_is_opened_is_said_not_to_answer() {
+    for greeting in ["", "< hi >", "< hi >< ok >"] {
+        let server = TcpListener::bind("127.0.0.1:0").unwrap();
+        let place: cantap_adapters::Place =
+            format!("socketcand://{}/can0", server.local_addr().unwrap()).parse().unwrap();
+        let stalls = std::thread::spawn(move || {
+            let (mut stream, _) = server.accept().unwrap();
+            stream.write_all(greeting.as_bytes()).unwrap();
+            // Until it is given up.
+            let _ = stream.read_to_end(&mut Vec::new());
+        });
+        let error = cantap_adapters::open(&place).err().unwrap();
+        assert!(matches!(error, OpenError::Foreign { .. }), "{greeting}: {error}");
+        stalls.join().unwrap();
+    }
+}
+
+#[test]
+fn pulled_out_it_ends_with_a_reason_and_nothing_captured_is_lost() {
+    let (place, streams, _messages) = start("can0");
+    let device = open(&format!("socketcand://{place}/can0"));
+    let mut server = streams.recv().unwrap();
+    device.listen(Channel::Can1, 500_000).unwrap();
+    server.write_all(b"< frame 123 1.0 11 >< frame 124 1.1 22 >< frame 12").unwrap();
+    server.shutdown(std::net::Shutdown::Both).unwrap();
+    let records: Vec<_> = device.records().collect();
+    let frames = records.iter().flatten().filter_map(|record| Some(record.frame()?.to_string()));
+    assert_eq!(frames.collect::<Vec<_>>(), ["123#11", "124#22"]);
+    let end = records.last().unwrap().as_ref().unwrap_err();
+    assert!(matches!(end, cantap::DeviceError::Vanished { .. }), "{end}");
+}

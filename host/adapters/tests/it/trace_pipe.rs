@@ -174,6 +174,15 @@ fn a_pcapng_pipe_whose_lengths_lie_is_read_on() {
         // Nothing more comes for now: what is whole does not wait for it.
         records.extend(until_frame(&device, &format!("{:03X}#AB", 0x300 + place)));
     }
+    // Half a block, and after a while its end; and what is no block at all.
+    pipe.write_all(&packet(0x3F0)[..20]).unwrap();
+    device.status().unwrap();
+    pipe.write_all(&packet(0x3F0)[20..]).unwrap();
+    assert_eq!(frames(&until_frame(&device, "3F0#AB")), ["3F0#AB"]);
+    pipe.write_all(&vec![0xA5; 1 << 20]).unwrap();
+    pipe.write_all(&packet(0x3F1)).unwrap();
+    let babbled = until_frame(&device, "3F1#AB");
+    assert!((1..1000).contains(&losses(&babbled).len()), "{}", losses(&babbled).len());
     pipe.write_all(&packet(0x400)[..20]).unwrap();
     drop(pipe);
     let whole = (1..=6).flat_map(|place| [0x200, 0x300].map(|id| format!("{:03X}#AB", id + place)));

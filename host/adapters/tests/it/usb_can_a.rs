@@ -20,6 +20,8 @@ enum Manner {
     Talks,
     /// Answers nothing.
     Mute,
+    /// Answers the first question, and nothing more.
+    Stalls,
     /// Is set to packets of fixed length, and ignores its settings.
     Fixed,
 }
@@ -56,6 +58,7 @@ impl StandIn {
         let seen = Arc::new(Mutex::new(Vec::new()));
         let log = Arc::clone(&seen);
         let mut bytes: Vec<u8> = Vec::new();
+        let mut questions = 0;
         let port = Port::start(move |byte| {
             bytes.push(byte);
             if bytes[0] != 0xAA {
@@ -83,11 +86,13 @@ impl StandIn {
             };
             let is_question = seen == Seen::Question;
             log.lock().unwrap().push(seen);
+            questions += u32::from(is_question);
             match manner {
+                Manner::Stalls if questions > 1 => Vec::new(),
                 Manner::Fixed if is_question => packet(&[1, 1, 1, 0x23, 1]),
                 Manner::Mute | Manner::Fixed => Vec::new(),
                 Manner::Talks if is_question => [answer, TALK.concat()].concat(),
-                Manner::Answers | Manner::Talks => answer,
+                Manner::Answers | Manner::Talks | Manner::Stalls => answer,
             }
         });
         Self { port, seen }
@@ -273,6 +278,24 @@ fn pulled_out_or_set_anew_it_ends_with_a_reason_and_nothing_captured_is_lost() {
         assert!(is_pulled || end.to_string().contains("variable length"), "{end}");
         assert_eq!(device.counters().channels[0].received, 100);
     }
+}
+
+/// Its questions stay without an answer: it is heard all the same, and told to be silent at the end.
+#[test]
+fn one_that_answers_no_more_holds_up_nothing() {
+    let adapter = StandIn::start(Manner::Stalls);
+    let device = open(&adapter.address());
+    device.listen(Channel::Can1, 500_000).unwrap();
+    while adapter.seen.lock().unwrap().iter().filter(|seen| **seen == Seen::Question).count() < 4 {
+        device.status().unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    adapter.port.says(TALK[0]);
+    let records = until_frame(&device, "123#DEAD");
+    assert_eq!((frames(&records), losses(&records)), (vec!["123#DEAD".to_owned()], vec![]));
+    device.stop().unwrap();
+    drop(device);
+    assert_eq!(adapter.seen().last(), Some(&settings(3, 1, 2)));
 }
 
 /// What python-can writes to the same stand-in, and what it reads there.

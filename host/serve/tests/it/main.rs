@@ -3,6 +3,7 @@
 mod board;
 mod browser;
 mod cannelloni;
+mod cannelloni_tcp;
 mod eight_clients;
 mod gvret;
 mod hostile;

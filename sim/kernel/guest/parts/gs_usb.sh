@@ -41,6 +41,52 @@ gs_attach || { cat attach.log gs.err; false; }
 verdict $? "gs_usb: the adapter is attached"
 wait_until has_interface can1
 check "gs_usb: the kernel's driver takes the stand-in for what it is" has_interface can1
+
+# The command sets it up, where it is asked to: not without rights, not while somebody receives, and as it was if a step fails.
+chmod 755 "$CANTAP"
+is_set() { iproute2 -details link show can0 > link.txt && grep -q "<.*[<,]UP[,>]" link.txt && grep -q "bitrate $1 sample-point $2" link.txt; }
+/usr/bin/setpriv --reuid 1000 --clear-groups "$CANTAP" interface can0 -b 500k > set.txt 2>&1
+[ $? = 1 ] && grep -q "As root: ip link set can0 up type can bitrate 500000 listen-only on;.*setcap cap_net_admin=ep $CANTAP" set.txt && ! is_set 500000 0
+verdict $? "interface: without rights it says the lines for root, and nothing is changed" "$(head -n 1 set.txt)"
+"$CANTAP" interface can0 -b 500k > set.txt 2>&1 && is_set 500000 0 && grep -q LISTEN-ONLY link.txt
+verdict $? "interface: bit rate, listening only, and up" "$(sed -n 's/^ *bitrate/bitrate/p' link.txt)"
+"$CANTAP" interface can0 -b 500k > set.txt 2>&1 && grep -q "was so already" set.txt
+verdict $? "interface: one that is so is left alone" "$(head -n 1 set.txt)"
+"$CANTAP" interface can0 -b 250k --mode normal --sample-point 75 --json > set.json 2> set.txt && is_set 250000 0.75 &&
+  ! grep -q LISTEN-ONLY link.txt && grep -q '"bitrate_bps":250000' set.json && grep -q '"mode":"normal"' set.json
+verdict $? "interface: another bit rate, mode and sample point" "$(cat set.json set.txt)"
+cp link.txt before.txt
+"$CANTAP" interface can0 -b 777777 > set.txt 2>&1
+[ $? = 1 ] && grep -q "777777 bit/s as [0-9]*, which is too far off.*can0 runs as before" set.txt && is_set 250000 0.75 && cmp -s before.txt link.txt
+verdict $? "interface: a bit rate that the clock does not reach leaves it as it was" "$(head -n 1 set.txt)"
+"$CANTAP" interface can0 -b 500k --data-bitrate 2M > set.txt 2>&1
+[ $? = 1 ] && grep -q "leave out what its driver or controller does not have. can0 runs as before" set.txt && is_set 250000 0.75 && cmp -s before.txt link.txt
+verdict $? "interface: CAN FD on a controller without it leaves it as it was" "$(head -n 1 set.txt)"
+# Its driver has no restart either.
+"$CANTAP" interface can0 -b 250k --mode normal --sample-point 75 --recovery 100ms > set.txt 2>&1
+[ $? = 1 ] && grep -q "restarted 100 ms after bus-off .*can0 runs as before" set.txt && is_set 250000 0.75 && cmp -s before.txt link.txt
+verdict $? "interface: a restart that its driver does not have leaves it as it was" "$(head -n 1 set.txt)"
+candump -L can0 > dump.txt 2> /dev/null &
+CANDUMP=$!
+wait_until receives can0 1
+"$CANTAP" interface can0 -b 500k > set.txt 2>&1
+[ $? = 1 ] && grep -q "programs receive from 'can0' (raw)" set.txt && is_set 250000 0.75 && kill -0 $CANDUMP
+verdict $? "interface: one that somebody receives from is not taken from them" "$(head -n 1 set.txt)"
+"$CANTAP" interface can0 -b 500k --yes > set.txt 2>&1 && is_set 500000 0
+verdict $? "interface: but with --yes" "$(cat set.txt | tr '\n' ' ')"
+kill $CANDUMP 2> /dev/null
+wait $CANDUMP 2> /dev/null
+"$CANTAP" interface can0 --restart > set.txt 2>&1
+[ $? = 1 ] && grep -q "can0' is not to be restarted" set.txt
+verdict $? "interface: what is not off its bus is not restarted" "$(head -n 1 set.txt)"
+"$CANTAP" interface can0 --down > set.txt 2>&1 && grep -q "^up  *no" set.txt && ! is_set 500000 0
+verdict $? "interface: it is taken down"
+iproute2 link add vcan9 type vcan
+"$CANTAP" interface vcan9 -b 500k > set.txt 2>&1
+[ $? = 1 ] && grep -q "'vcan9' is virtual (vcan): it has no bit rate" set.txt
+verdict $? "interface: a virtual one has no bit rate, and says so" "$(head -n 1 set.txt)"
+iproute2 link del vcan9
+
 can_is_up can0 off && can_is_up can1 off
 verdict $? "gs_usb, kernel: both channels are up"
 "$CANTAP" info -d can0 > info.txt 2>&1
@@ -97,6 +143,24 @@ verdict $? "gs_usb, kernel: an interface that only listens is said to"
 timeout 60 "$CANTAP" send -d can1 1 123#04 > send.txt 2>&1
 [ $? != 0 ]
 verdict $? "gs_usb, kernel: on an interface that only listens nothing is sent" "$(tail -n 1 send.txt)"
+
+# Pulled out behind the kernel's driver, plugged in again, and set up by the command: the capture goes on.
+can_is_up can1 off
+gs_start -d can0
+wait_until receives can0 1
+cansend can1 001#
+is_in_capture() { grep -q " $1" capture.log; }
+wait_until is_in_capture 001#
+kill $GS_SERVER
+wait_until has_told "can0 is gone"
+verdict $? "gs_usb, kernel: a pulled adapter is reported, with what to do" "$(grep 'is gone' capture.err | head -n 1)"
+wait_until has_no_gs
+gs_attach && wait_until has_interface can1
+"$CANTAP" interface can1 -b 500k --mode normal > set.txt 2>&1 && "$CANTAP" interface can0 -b 500k --mode normal >> set.txt 2>&1
+verdict $? "gs_usb, kernel: it is back, and set up again"
+wait_until has_told "the device is back after" && wait_until receives can0 1 && cansend can1 002# && wait_until is_in_capture 002# && gs_end &&
+  grep -q '"gaps":{"count":1,' capture.json
+verdict $? "gs_usb, kernel: the capture continues, and has the gap" "$(frames_on can0 capture.log | tr '\n' ' ')"
 
 # Without the kernel's driver.
 "$CANTAP" info -d gs_usb: > info.txt 2>&1

@@ -69,7 +69,13 @@ fn babbling_is_counted_and_costs_no_memory_and_no_silence() {
 
 #[test]
 fn pulled_out_it_ends_with_a_reason_and_nothing_captured_is_lost() {
-    let adapter = StandIn::start(Chip::Elm);
+    for chip in [Chip::Elm, Chip::Stn] {
+        is_pulled_out(chip);
+    }
+}
+
+fn is_pulled_out(chip: Chip) {
+    let adapter = StandIn::start(chip);
     let device = open(&adapter.address());
     device.listen(Channel::Can1, 500_000).unwrap();
     for id in 0..100 {

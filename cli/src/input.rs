@@ -136,6 +136,9 @@ pub fn filtered(filters: &[Filter]) -> Vec<u8> {
 /// Broken lines are reported individually until it is clear that the whole file is broken.
 const ISSUES_SHOWN: u64 = 20;
 
+/// How many are shown of a file in which there is nothing else.
+const ISSUES_OF_NO_TRACE: u64 = 3;
+
 /// The records of a trace or a device. Issues go to standard error.
 pub struct Records {
     source: Source,
@@ -342,17 +345,24 @@ fn batch_of_file(
     strict: bool,
     records: &mut Vec<TraceRecord>,
 ) -> anyhow::Result<bool> {
-    let nothing = loop {
+    // Of a file that is no trace, every line is one: what it looks like says more than twenty of them.
+    let mut held = Vec::new();
+    let has_records = loop {
         match reader.next(records)? {
-            Progress::Records => return Ok(true),
+            Progress::Records => break true,
             Progress::Issue(issue, _) if strict => bail!(issue),
-            Progress::Issue(issue, number) if number <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
+            Progress::Issue(issue, number) if number <= ISSUES_OF_NO_TRACE => eprintln!("cantap: {issue}"),
+            Progress::Issue(issue, number) if number <= ISSUES_SHOWN => held.push(issue),
             Progress::Issue(..) => {}
-            Progress::End(nothing) => break nothing,
+            Progress::End(Some(nothing)) => bail!(nothing),
+            Progress::End(None) => break false,
         }
     };
-    if let Some(nothing) = nothing {
-        bail!(nothing);
+    for issue in held {
+        eprintln!("cantap: {issue}");
+    }
+    if has_records {
+        return Ok(true);
     }
     for (what, count) in reader.notes().iter() {
         eprintln!("cantap: note: {what} ({count})");

@@ -45,6 +45,9 @@ fn every_command_fails_where_nothing_could_be_read_and_says_what_the_file_looks_
         assert!(err.contains("expected a log line such as"), "{err}");
         assert!(!out.contains("equal") && !out.contains("frames"), "{arguments:?}: {out}");
     }
+    // A few of its lines are examples enough.
+    let (_, _, err) = cantap(&directory, &["convert", "diary.log", "new.asc"]);
+    assert_eq!(err.lines().count(), 4, "{err}");
     let (code, _, err) = cantap(&directory, &["align", "other.log", "diary.log", "-o", "aligned.log"]);
     assert!(code == Some(1) && err.contains("diary.log: no frame could be read"), "{code:?} {err}");
     let mut made: Vec<_> =

@@ -6,7 +6,7 @@ use super::{Format, table};
 pub(crate) const HEAD_BYTES: usize = 512;
 
 /// Other files that users mistake for traces, by their first bytes.
-const KNOWN: [(&[u8], &str); 14] = [
+const KNOWN: [(&[u8], &str); 17] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
     (b"\x7FELF", "a program"),
@@ -20,11 +20,16 @@ const KNOWN: [(&[u8], &str); 14] = [
     (b"{", "JSON"),
     (b"[", "JSON or settings"),
     (b"FormatVersion=", "a SYM database"),
+    (b"\"No.\",\"Time\",", LIST_OF_WIRESHARK),
+    (b"No.     Time ", LIST_OF_WIRESHARK),
+    (b"Frame 1: ", LIST_OF_WIRESHARK),
     (
         b"Generic File",
         "a compressed or encrypted file of a CANedge logger (.MFC, .MFE, .MFM): its maker's converters make an MF4 of it, which is read here",
     ),
 ];
+
+const LIST_OF_WIRESHARK: &str = "a list of packets that Wireshark printed, in which its newer versions have no bytes of frames: what it saves as pcapng has all, and is read here";
 
 /// What else than a trace a file with this beginning is, if that is known.
 pub(crate) fn known(head: &[u8]) -> Option<&'static str> {
@@ -105,6 +110,10 @@ mod tests {
             (b"icsbin\x02", "a file of Vehicle Spy (.vsb), which saves traces as CSV or ASC, too"),
             (b"(1.0) can0 123#11\n", "a trace in the format candump"),
             (b"\0\x01\x02", "binary data that begins with 00 01 02"),
+            (
+                b"\"No.\",\"Time\",\"Source\",\"Destination\",\"Protocol\",\"Length\",\"Info\"\n\"1\",\"0.0\",\"\",\"\",\"CAN\",\"16\",\"ID: 291 (0x123), Length: 8\"\n",
+                LIST_OF_WIRESHARK,
+            ),
             (b"dear diary\ntoday", "text that begins with 'dear diary'"),
             (b"\xFF\xFEa", "text that begins with '\u{FFFD}\u{FFFD}a'"),
         ] {

@@ -130,12 +130,13 @@ impl Decode for Decoder {
     }
 }
 
-/// Whether a text begins like a table of python-can, of ours or of the analyser.
+/// Whether a text begins like a table of python-can, with the names of its columns or without, of ours or of the analyser.
 pub(crate) fn is_head(text: &[u8]) -> bool {
     // Tables of others have some of the same names.
     text.starts_with(b"timestamp,arbitration_id,extended")
         || text.starts_with(b"time,channel,direction")
         || analyser::is_head(text)
+        || python_can::is_row(text.split(|byte| *byte == b'\n').next().unwrap_or_default().trim_ascii())
 }
 
 /// More lines than this before the header are not comments.
@@ -269,6 +270,27 @@ mod tests {
             "time,channel,direction,type,id,dlc,data,event,device_ns\n\
              1483389946.197000,1,Rx,data,00DADADA,7,5B34322C20395D,,\n"
         );
+    }
+
+    /// With the names of its columns cut off, flags were once taken for lengths and bytes, and the bytes for something without a place in a trace.
+    #[test]
+    fn python_cans_rows_are_known_without_the_names_above_them() {
+        let rows = "1691588499.4185264,0x4,0,0,1,8,AAQAAAAAAAA=\n1691588499.482613,0xcfff048,1,0,0,2,EiM=\n\
+                    1691588499.483165,0x123,0,0,0,0,\n";
+        for file in [rows.to_owned(), rows.lines().skip(1).map(|row| format!("{row}\n")).collect()] {
+            assert_eq!(
+                Format::of_content(file.as_bytes()),
+                Some(Format::Csv(CsvDialect::PythonCan)),
+                "{file}"
+            );
+        }
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), rows);
+        assert_eq!(issues, Vec::<String>::new());
+        assert!(matches!(records[0].event, TraceEvent::State { .. }), "{records:?}");
+        let log = "(1691588499.482613) can0 0CFFF048#1223\n(1691588499.483165) can0 123#\n";
+        assert_eq!(tests::write(Format::Candump, &records[1..]), log);
+        // Nor are such rows with other separators a table with as many bytes as its third column says.
+        assert_eq!(Format::of_content(rows.replace(',', ";").as_bytes()), None);
     }
 
     /// python-can writes a longer frame with its length and bytes, and nothing else that shows it is FD.

@@ -31,6 +31,7 @@ pub(crate) struct Decoder {
     begun: bool,
     /// Whether an object was entered for the array in it.
     inside: bool,
+    around: Around,
     notes: Vec<&'static str>,
     noted: Vec<&'static str>,
 }
@@ -39,6 +40,45 @@ pub(crate) struct Decoder {
 struct Column {
     name: String,
     form: TypedForm,
+}
+
+/// What an object says of all frames in its array, such as the time at which an adapter sent them on.
+#[derive(Default)]
+struct Around {
+    fields: Vec<Field>,
+    /// How many bytes of the object are still to come.
+    rest: usize,
+}
+
+impl Around {
+    /// Of the fields of an object of which so many bytes are left behind the beginning of its array.
+    fn of(mut fields: Vec<Field>, rest: usize) -> Self {
+        for field in &mut fields {
+            if field.name == "type" && matches!(field.value.as_str(), "rx" | "tx") {
+                "direction".clone_into(&mut field.name);
+            }
+        }
+        fields.retain(|field| table::role_of_many(&field.name).is_some());
+        Self { fields, rest }
+    }
+
+    /// Adds to a frame's own fields what they do not say.
+    fn add_to(&self, fields: &mut Vec<Field>) {
+        for field in &self.fields {
+            let role = table::role_of_many(&field.name);
+            if fields.iter().all(|own| table::role_of_many(&own.name) != role) {
+                fields.push(field.clone());
+            }
+        }
+    }
+
+    /// Goes on by so many bytes.
+    fn pass(&mut self, bytes: usize) {
+        self.rest = self.rest.saturating_sub(bytes);
+        if self.rest == 0 {
+            self.fields.clear();
+        }
+    }
 }
 
 /// Whether a text begins with such frames.
@@ -56,15 +96,26 @@ pub(crate) fn is_head(head: &[u8]) -> bool {
 /// The objects of a text, up to one that is not whole.
 fn objects(text: &[u8]) -> impl Iterator<Item = Vec<Field>> {
     let (mut at, mut inside) = (0, false);
+    let mut around = Around::default();
     std::iter::from_fn(move || {
         loop {
             match object::next(&text[at..], inside) {
                 Next::Object { start, end, inner } => {
-                    let fields = object::fields(&text[at + start..at + end]);
+                    let mut fields = object::fields(&text[at + start..at + end]);
                     let is_frame = |fields: &Vec<Field>| Decoder::default().is_frame(fields);
                     match inner.filter(|_| !fields.as_ref().is_some_and(is_frame)) {
-                        Some(inner) => (at, inside) = (at + inner, true),
-                        None => at += end,
+                        Some(inner) => {
+                            around = Around::of(fields.clone().unwrap_or_default(), end - inner);
+                            (at, inside) = (at + inner, true);
+                        }
+                        None => {
+                            around.pass(start);
+                            if let Some(fields) = &mut fields {
+                                around.add_to(fields);
+                            }
+                            around.pass(end - start);
+                            at += end;
+                        }
                     }
                     if let Some(fields) = fields {
                         return Some(fields);
@@ -273,20 +324,21 @@ impl Decode for Decoder {
                 Next::Object { start, end, inner } => {
                     let fields = object::fields(&text[start..end]);
                     match fields {
-                        Some(fields) => {
+                        Some(mut fields) => {
                             let enters =
                                 inner.filter(|_| own_frame(&fields).is_none() && !self.is_frame(&fields));
                             self.inside |= enters.is_some();
                             let used = enters.unwrap_or(end);
-                            (
-                                start,
-                                used,
-                                Some(if enters.is_some() {
-                                    Ok(Line::Nothing)
-                                } else {
-                                    self.object(fields, &zone)
-                                }),
-                            )
+                            let line = if let Some(inner) = enters {
+                                self.around = Around::of(fields, end - inner);
+                                Ok(Line::Nothing)
+                            } else {
+                                self.around.pass(start);
+                                self.around.add_to(&mut fields);
+                                self.around.pass(end - start);
+                                self.object(fields, &zone)
+                            };
+                            (start, used, Some(line))
                         }
                         None => (start, end, Some(Err(Fault::malformed(EXPECTED, shown(&text[start..end]))))),
                     }

@@ -92,6 +92,11 @@ impl Decoder {
         let extended = marked.or(parts.extended).unwrap_or(raw > 0x7FF);
         let id = identifier(raw, extended, shown)?;
         let bytes = if remote { &[] } else { bytes };
+        // What stands behind the label is there, and is no bytes.
+        let unread = parts.data.filter(|data| bytes.is_empty() && !remote && tokens(data).next().is_some());
+        if let (Some(data), None) = (unread, parts.len) {
+            return Err(Fault::malformed("data bytes", data));
+        }
         let len = parts.len.unwrap_or(bytes.len());
         if !remote && len != bytes.len() {
             let found = counted(bytes.len(), "byte");

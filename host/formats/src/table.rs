@@ -105,6 +105,16 @@ fn first_lines(head: &[u8]) -> impl Iterator<Item = &[u8]> {
     lines.filter(|line| !line.is_empty() && !line.starts_with(b"#"))
 }
 
+/// What a name says of a frame, if it is something that many frames may have in common: `0`, `1` and `2` for the time, the channel and the direction.
+pub(crate) fn role_of_many(name: &str) -> Option<u8> {
+    match columns::role_of(name.as_bytes())?.0 {
+        Role::Time => Some(0),
+        Role::Channel => Some(1),
+        Role::Direction => Some(2),
+        _ => None,
+    }
+}
+
 /// Columns as a user may give them for a table that is not known by itself.
 pub(crate) fn proposal(head: &[u8]) -> Option<String> {
     layout::proposal(first_lines(head).next()?)

@@ -173,9 +173,10 @@ fn error_of(class: u32, position: u8, counters: (u8, u8)) -> TraceEvent {
     TraceEvent::BusError { kind, counters: Some(counters) }
 }
 
-/// Whether a text, and its first line, are those of such a file's head.
+/// Whether a text, and its first line, are those of such a file's head, or rows cut out of such a file.
 pub(crate) fn is_head(text: &[u8], line: &[u8]) -> bool {
-    text.starts_with(b";$FILEVERSION")
+    decode::is_row(line)
+        || text.starts_with(b";$FILEVERSION")
         || text.starts_with(b"$STARTTIME=")
         || text.starts_with(b";####")
         || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
@@ -250,7 +251,14 @@ mod tests {
             ("      1      1841.000 DT 2      0123 Rx -  2  11 22", "(1.841000) can1 123#1122\n"),
         ];
         for (row, expected) in rows {
-            let (records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), format!("{row}\r\n"));
+            let file = format!("{row}\r\n");
+            // Once it had to be said: its times, in milliseconds, were proposed as seconds of a table.
+            assert!(
+                Format::of_content(file.as_bytes())
+                    .is_some_and(|of| of.is_kind_of(Format::Trc(TrcVersion::V2_1))),
+                "{row}"
+            );
+            let (records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), file);
             assert_eq!(issues, Vec::<String>::new(), "{row}");
             assert_eq!(tests::write(Format::Candump, &records), expected, "{row}");
         }

@@ -20,6 +20,7 @@ use cantap_trace::{Direction, TraceRecord};
 
 const RESTARTED: &str =
     "the adapter's stamps and the computer's clock went apart: the times go on from the computer's";
+const NO_STAMP: &str = "frames that were sent have no stamp: they stand at that of the frame before them";
 const NOT_SENT: &str = "frames that could not be sent";
 
 /// A stamp's unit.
@@ -73,6 +74,8 @@ pub(crate) struct Decoder {
     anchor: Option<(i64, i64)>,
     /// The last time of day, and the days before it.
     day: (i64, i64),
+    /// The last frame's time, in nanoseconds; 0 before the first.
+    last_ns: i64,
     note: Option<&'static str>,
 }
 
@@ -174,8 +177,16 @@ impl Decoder {
                 Part::Other => {}
             }
         }
-        let time_ns =
-            self.time_ns(clock, stamp).ok_or_else(|| Fault::malformed("a time in each row", b""))?;
+        let time_ns = match self.time_ns(clock, stamp) {
+            Some(time_ns) => time_ns,
+            // The adapter stamps what it receives; without the computer's time there is nothing else.
+            None if direction == Direction::Tx => {
+                self.note = Some(NO_STAMP);
+                self.last_ns
+            }
+            None => return Err(Fault::malformed("a time in each row", b"")),
+        };
+        self.last_ns = time_ns;
         let digits = id.trim_end_matches(['H', 'h', ' ']).as_bytes();
         let raw = text::number(digits, false);
         let raw =
@@ -315,6 +326,22 @@ mod tests {
         let expected = "(57423.554100) can0 1AA#0000000000B1\n(57424.232800) can0 0CF02990#10A1\n(57425.500000) can0 214#96 T\n\
             (57426.761949) can0 027##1010102030405060708090A0B\n";
         assert_eq!(log, expected);
+    }
+
+    /// CANTest without the column of the computer's time: only what was received has a stamp.
+    #[test]
+    fn frames_that_were_sent_without_a_stamp_stand_at_the_one_before() {
+        let table = "序号\t传输方向\t时间标识\t名称\t帧ID\t帧格式\t帧类型\t数据长度\t数据(HEX)\n\
+             0\t接收\t0x3039\t无\t0x00000123\t数据帧\t标准帧\t0x02\t01 02\n\
+             1\t发送\t无\t无\t0x18fef100\t数据帧\t扩展帧\t0x01\t03\n2\t接收\t无\t无\t0x00000123\t数据帧\t标准帧\t0x00\t\n";
+        let source = std::io::Cursor::new(table);
+        let mut reader =
+            TraceReader::from_source("a.txt", source, Format::UsbCan, &ReadOptions::default()).unwrap();
+        assert_eq!(reader.by_ref().filter(Result::is_ok).count(), 2);
+        assert_eq!(reader.notes().iter().collect::<Vec<_>>(), [(super::NO_STAMP, 1)]);
+        let (log, issues) = as_log(table);
+        assert_eq!(log, "(1.234500) can0 123#0102\n(1.234500) can0 18FEF100#03 T\n");
+        assert_eq!(issues.len(), 1, "{issues:?}");
     }
 
     #[test]

@@ -190,7 +190,8 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     if channel.transmit_failures > 0 {
         let _ = writeln!(out, "  sending   {} not sent", counted(channel.transmit_failures, "frame"));
     }
-    if !channel.peaks.is_empty() {
+    // Of a channel of which only states are known, no window is busy.
+    if channel.peaks.iter().any(|window| window.frames_per_s > 0.0) {
         out.push_str("  busiest windows\n");
         let zero_s = summary.origin_s.unwrap_or(0.0);
         for window in &channel.peaks {

@@ -60,13 +60,18 @@ pub struct ChannelStatistics {
     gaps: u32,
     first_bits: u64,
     latest_frame_ns: Option<i64>,
-    /// Time between frames, where it went forward.
+    /// Time between frames, where it went on.
     covered_ns: u64,
+    /// How far it has gone: the latest frame's time since the clock was last set back.
+    reached_ns: i64,
     /// The common divisor of all intervals between two frames; 0 before the first.
     step_ns: u64,
     /// Frames with the same stamp as the frame before.
     shared_stamps: u64,
 }
+
+/// No two stamps of one recording are so far out of order.
+const SET_BACK_NS: i64 = 1_000_000_000;
 
 /// Errors detected by a channel's controller.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -159,6 +164,7 @@ impl ChannelStatistics {
             first_bits: 0,
             latest_frame_ns: None,
             covered_ns: 0,
+            reached_ns: i64::MIN,
             step_ns: 0,
             shared_stamps: 0,
         }
@@ -254,8 +260,15 @@ impl ChannelStatistics {
                 self.step_ns = common_divisor(self.step_ns, step);
             }
         }
+        // Frames that are stamped a little out of order add nothing twice: only a longer way back is a clock that was set back.
+        let is_first = self.latest_frame_ns.is_none();
+        if is_first || end_ns.saturating_add(SET_BACK_NS) < self.reached_ns {
+            self.reached_ns = end_ns;
+        }
+        let ahead = end_ns.saturating_sub(self.reached_ns).max(0);
+        self.reached_ns = self.reached_ns.max(end_ns);
         self.latest_frame_ns = Some(end_ns);
-        self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
+        self.covered_ns = self.covered_ns.saturating_add(ahead as u64);
         self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
         if let Some(load) = &mut self.load {
             // Without its rate, the data phase has no bits here: see `fd_frame`.

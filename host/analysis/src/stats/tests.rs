@@ -225,6 +225,21 @@ fn stamps_coarser_than_the_frames_are_noticed() {
     assert!(fine.load.unwrap().window_mean_pct.is_some());
 }
 
+/// A log whose stamps went back thousands of times once lasted as long as all ways forward together, and its bus was nearly idle.
+#[test]
+fn stamps_out_of_order_add_no_time_and_a_clock_that_is_set_back_does() {
+    let mut statistics = at_1_mbit();
+    for n in 0..100 {
+        statistics.push(&frame(10_001_000 + n * 1000, 1, "123#"));
+        statistics.push(&frame(10_000_200 + n * 1000, 1, "124#"));
+    }
+    let duration_s = |statistics: &Statistics| statistics.summary().channels[0].duration_s;
+    assert!((duration_s(&statistics) - 0.099).abs() < 1e-9, "{}", duration_s(&statistics));
+    statistics.push(&frame(5_000_000, 1, "123#"));
+    statistics.push(&frame(5_500_000, 1, "123#"));
+    assert!((duration_s(&statistics) - 0.599).abs() < 1e-9, "{}", duration_s(&statistics));
+}
+
 /// Times since 1970 have more digits than a float.
 #[test]
 fn the_first_and_last_time_are_told_to_the_nanosecond() {

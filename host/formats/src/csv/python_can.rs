@@ -82,6 +82,12 @@ impl Message {
     }
 }
 
+/// Whether a line is a row: with no names above them, its flags and its bytes in base64 look like other tables' lengths and labels.
+pub(super) fn is_row(line: &[u8]) -> bool {
+    let is_hex = columns(line).is_ok_and(|[_, id, ..]: [&[u8]; 7]| id.starts_with(b"0x"));
+    is_hex && row(line, &mut ErrorFrames::default()).is_ok()
+}
+
 /// A row.
 pub(super) fn row(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault> {
     /// 64 bytes in base64.

@@ -49,6 +49,14 @@ fn objects_of_different_programs_are_read_whole() {
             "{\"topic\":\"can/rx\",\"payload\":{\"timestamp\":1.25,\"id\":\"7DF\",\"dlc\":2,\"data\":\"0201\"}}\n",
             "(1.250000) can0 7DF#0201\n",
         ),
+        // WiCAN's messages: what stands around the frames is said of each, and `extd` is the driver's word for 29 bits.
+        (
+            "{\"bus\":\"0\",\"type\":\"rx\",\"ts\":34610,\"frame\":[{\"id\":123,\"dlc\":2,\"rtr\":false,\"extd\":true,\"data\":[7,8]},\
+             {\"id\":124,\"dlc\":1,\"rtr\":false,\"extd\":false,\"data\":[9]}]}\n\
+             {\"bus\":\"0\",\"type\":\"tx\",\"ts\":34710,\"frame\":[{\"id\":124,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"ts\":34810,\"id\":124,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}\n",
+            "(34.610000) can0 0000007B#0708\n(34.610000) can0 07C#09\n(34.710000) can0 07C# T\n(34.810000) can0 07C#\n",
+        ),
         // `tshark -T ek`: a line about the index before each frame, the time twice, decimal identifiers in texts.
         (
             "{\"index\":{\"_index\":\"packets-2023-11-14\",\"_type\":\"doc\"}}\n\

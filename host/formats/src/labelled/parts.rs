@@ -205,7 +205,7 @@ pub(super) fn are_names(line: &[u8]) -> bool {
 
 /// The words of a value.
 pub(super) fn tokens(value: &[u8]) -> impl Iterator<Item = &[u8]> {
-    let is_between = |byte: &u8| byte.is_ascii_whitespace() || b",;[](){}|-:.".contains(byte);
+    let is_between = |byte: &u8| byte.is_ascii_whitespace() || b",;[](){}|-:.\"".contains(byte);
     value.split(is_between).filter(|word| !word.is_empty())
 }
 

@@ -37,6 +37,12 @@ fn what_the_examples_of_arduino_teensy_and_esp_idf_print_is_read() {
             "(86399.900000) can0 100#0102\n(86400.100000) can0 100#03\n",
         ),
         (
+            "bytes between quotation marks, as the line protocol of InfluxDB has texts",
+            "can,bus=can0,id=123 data=\"0102030405060708\",dlc=8i 1704067200000000000\n\
+             can,bus=can0,id=18FEF100 data=\"01020304\",dlc=4i 1704067200010000000\n",
+            "(0.000000) can0 123#0102030405060708\n(0.000000) can0 18FEF100#01020304\n",
+        ),
+        (
             "FlexCAN_T4",
             "MB 0  OVERRUN: 0  LEN: 8 EXT: 0 TS: 42303 ID: 2C4 Buffer: 3 87 0 30 0 80 61 69 \n\
              MB 99  OVERRUN: 0  LEN: 3 EXT: 1 TS: 44802 ID: 20 Buffer: 0 0 7 \n",

@@ -6,7 +6,9 @@ use cantap_trace::Direction;
 use cantap_trace::fd::FD_MAX_BYTES;
 
 pub(super) fn id(shown: &[u8], decimal: bool) -> Result<u32, Fault> {
-    let digits = shown.strip_suffix(b"h").or_else(|| shown.strip_suffix(b"x")).unwrap_or(shown);
+    // Also in front of the bytes: `0x085: 7C 33`.
+    let mark = shown.last().filter(|last| matches!(last, b'h' | b'x' | b':'));
+    let digits = &shown[..shown.len() - usize::from(mark.is_some())];
     let digits = if decimal { whole(digits) } else { digits };
     let number = text::number(digits, decimal);
     let expected =

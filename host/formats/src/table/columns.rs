@@ -235,7 +235,8 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
     }
     // As sketches call what their boards count.
     match plain {
-        "t" => return Some((Role::Time, None)),
+        // AutoPi's `_stamp`.
+        "t" | "stamp" => return Some((Role::Time, None)),
         "millis" => return Some((Role::Time, Some(Form::Unit(1_000_000)))),
         "micros" => return Some((Role::Time, Some(Form::Unit(1_000)))),
         _ => {}
@@ -255,7 +256,7 @@ pub(super) fn role_of(name: &[u8]) -> Option<(Role, Option<Form>)> {
         "channel" | "chn" | "ch" | "interface" | "network" | "buschannel" | "canchannel" | "kanal" => {
             Role::Channel
         }
-        "extended" | "ide" | "ext" | "isextended" | "isextendedid" | "extendedid" | "idtype" => {
+        "extended" | "ide" | "ext" | "extd" | "isextended" | "isextendedid" | "extendedid" | "idtype" => {
             Role::Extended
         }
         "remote" | "remoteedlbrsesi" | "rtr" | "isremote" | "isrtr" | "isremoteframe" => Role::Remote,
@@ -319,6 +320,8 @@ mod tests {
             ("DLC", Role::Dlc),
             ("Bus", Role::Channel),
             ("t", Role::Time),
+            ("_stamp", Role::Time),
+            ("extd", Role::Extended),
             ("MessageLength", Role::Dlc),
         ] {
             assert_eq!(role_of(name.as_bytes()).map(|(role, _)| role), Some(role), "{name}");

@@ -264,7 +264,9 @@ impl Layout {
         let is_byte = |cell: &&[u8]| cell.len() == 2 && text::hex(cell).is_some();
         let one_each = data.iter().take(len).take_while(|cell| is_byte(cell)).count() == len;
         let in_one = len > 1 && data.first().is_some_and(|cell| byte_count(cell) == Some(len));
-        if !one_each && !in_one || separator == Separator::Blanks && len == 0 {
+        // Where a frame has no bytes, more numbers behind its length are not what this takes them for.
+        let is_empty = len == 0 && data.len() > 1 && !data[0].is_empty() && !is_byte(&data[0]);
+        if !one_each && !in_one || is_empty || separator == Separator::Blanks && len == 0 {
             return None;
         }
         let mut places = [None; ROLES.len()];
@@ -333,11 +335,11 @@ fn is_stamp(cell: &[u8]) -> bool {
     matches!((at, cell.len() - at - 1), (2 | 8, 6 | 9)) && digits.iter().all(u8::is_ascii_digit)
 }
 
-/// How many bytes a cell of hexadecimal digits is, without gaps or with a blank after each byte.
+/// How many bytes a cell of hexadecimal digits is: without gaps, or with a blank between two, or a colon, as `tshark -T fields` has it.
 fn byte_count(cell: &[u8]) -> Option<usize> {
-    if cell.contains(&b' ') {
+    if let Some(gap) = cell.iter().find(|byte| matches!(byte, b' ' | b':')) {
         let is_byte = |word: &[u8]| word.len() == 2 && text::hex(word).is_some();
-        return cell.split(|byte| *byte == b' ').all(is_byte).then_some(cell.len() / 3 + 1);
+        return cell.split(|byte| byte == gap).all(is_byte).then_some(cell.len() / 3 + 1);
     }
     let all = cell.len().is_multiple_of(2) && cell.iter().all(u8::is_ascii_hexdigit);
     all.then_some(cell.len() / 2)
@@ -367,28 +369,48 @@ pub(super) fn proposal(line: &[u8]) -> Option<String> {
 pub(super) fn proposal_of_row(line: &[u8]) -> Option<String> {
     let cells = Separator::of(line).cells(line);
     let bare = |cell: &'_ [u8]| text::after_0x(cell).unwrap_or(cell).to_vec();
-    let is_byte = |cell: &&&[u8]| bare(cell).len() == 2 && text::hex(&bare(cell)).is_some();
-    let bytes = cells.iter().rev().take_while(is_byte).count();
+    // Sketches print no leading zeros.
+    let is_byte = |cell: &&&[u8]| matches!(bare(cell).len(), 1 | 2) && text::hex(&bare(cell)).is_some();
+    let mut bytes = cells.iter().rev().take_while(is_byte).count();
+    let is_len = |cell: &[u8], bytes: usize| text::decimal(cell) == Some(bytes as u64);
+    // One digit before as many bytes is their number; two may be the first byte of a request or a response.
+    let first = cells[cells.len() - bytes..].first();
+    if first.is_some_and(|first| first.len() == 1 && is_len(first, bytes - 1)) {
+        bytes -= 1;
+    }
     let before = &cells[..cells.len() - bytes];
-    let is_id = |cell: &&[u8]| matches!(bare(cell).len(), 3 | 4 | 8) && text::hex(&bare(cell)).is_some();
+    let is_id = |cell: &&[u8]| {
+        let digits = bare(cell.strip_suffix(b":").unwrap_or(cell));
+        matches!(digits.len(), 3 | 4 | 8) && text::hex(&digits).is_some()
+    };
+    let is_time = |cell: &[u8]| {
+        is_clock(cell)
+            || cell.iter().any(|byte| matches!(byte, b'.' | b','))
+                && text::time_of_any_mark(cell, NS_PER_S).is_some()
+    };
+    let time_in = |cells: &[&[u8]]| {
+        let at = cells.iter().position(|cell| is_time(cell));
+        at.map_or(String::new(), |at| format!("time={},", at + 1))
+    };
     // All bytes in a cell, with something between them.
     let in_one = bytes == 0
         && cells
             .last()
             .is_some_and(|cell| cell.len() > 4 && cell.contains(&b' ') && byte_count(cell).is_some());
     if in_one {
-        let id = before[..before.len() - 1].iter().rposition(is_id)?;
-        return Some(format!("id={}:hex,data={}:hex", id + 1, cells.len()));
+        let before = &before[..before.len() - 1];
+        // One of 29 bits in decimal digits has more of them.
+        let is_decimal =
+            |cell: &&[u8]| cell.len() == 9 && text::decimal(cell).is_some_and(|id| id <= 0x1FFF_FFFF);
+        let (id, radix) = match before.iter().rposition(is_id) {
+            Some(id) => (id, "hex"),
+            None => (before.iter().rposition(is_decimal)?, "dec"),
+        };
+        return Some(format!("{}id={}:{radix},data={}:hex", time_in(before), id + 1, cells.len()));
     }
     let id = before.iter().rposition(is_id).filter(|_| bytes > 0)?;
-    let is_time = |cell: &&[u8]| {
-        is_clock(cell)
-            || cell.iter().any(|byte| matches!(byte, b'.' | b','))
-                && text::time_of_any_mark(cell, NS_PER_S).is_some()
-    };
-    let time = before[..id].iter().position(is_time).map_or(String::new(), |at| format!("time={},", at + 1));
-    let is_len =
-        before.len() > id + 1 && before.last().is_some_and(|len| text::decimal(len) == Some(bytes as u64));
-    let len = if is_len { format!("dlc={},", before.len()) } else { String::new() };
+    let time = time_in(&before[..id]);
+    let has_len = before.len() > id + 1 && before.last().is_some_and(|len| is_len(len, bytes));
+    let len = if has_len { format!("dlc={},", before.len()) } else { String::new() };
     Some(format!("{time}id={}:hex,{len}bytes={}:hex", id + 1, before.len() + 1))
 }

@@ -185,6 +185,11 @@ fn tables_of_public_collections_are_known_and_read_whole() {
             "Time,ID,Extended,Name,Data_1,Data_2,Length,Error,Remote\n1.8173 sec,419427898,1,,0,200,2,0,0\n",
             "(1.817300) can0 18FFF63A#00C8\n",
         ),
+        // `tshark -T fields` with commas: decimal identifiers, bytes with colons between them.
+        (
+            "0.000000000,291,2,01:02\n0.010000000,419361024,1,03\n0.020000000,291,0,\n",
+            "(0.000000) can0 123#0102\n(0.010000) can0 18FEF100#03\n(0.020000) can0 123#\n",
+        ),
         // Of programs for lessons.
         (
             "0.001 0x100 204E000000000000\n0.002 0x18DAF110 507D\n",
@@ -403,12 +408,20 @@ fn rows_without_names_get_columns_by_their_numbers_to_try() {
         ("ATMA\r\n18DAF110 8 03 41 0C 1A 00 00 00 00", Some("id=1:hex,dlc=2,bytes=3:hex")),
         ("1.5 can0 Rx 123 AA", Some("time=1,id=4:hex,bytes=5:hex")),
         ("415,FE,15", Some("id=1:hex,bytes=2:hex")),
+        // Sketches print no leading zeros: the bytes before the last ones of two digits were once left out.
+        ("1B6,20,3,29,4,29,0,20", Some("id=1:hex,bytes=2:hex")),
+        ("1.5 123 2 1 F", Some("time=1,id=2:hex,dlc=3,bytes=4:hex")),
+        ("820298   0x085: 7C 33 80", Some("id=2:hex,bytes=3:hex")),
         ("0x123,11 22 33", Some("id=1:hex,data=2:hex")),
+        ("469533221,1714730974.56,2C EE 00", Some("time=2,id=1:dec,data=3:hex")),
         ("a text of words", None),
         ("2024-01-01 12:00:00 started", None),
     ] {
         assert_eq!(super::proposal_of_rows(row.as_bytes()).as_deref(), columns, "{row}");
     }
+    let (log, issues) =
+        with_columns("time=1:ms,id=2:hex,bytes=3:hex", "820298   0x085: 7C 33\n820301   0x047: 20\n");
+    assert_eq!((log.as_str(), issues), ("(820.298000) can0 085#7C33\n(820.301000) can0 047#20\n", vec![]));
     let (log, issues) = with_columns("id=1:hex,bytes=2:hex", "7E8 03 41 0C 1A\n7E9 01\n");
     assert_eq!((log.as_str(), issues), ("(0.000000) can0 7E8#03410C1A\n(0.000000) can0 7E9#01\n", vec![]));
 }

@@ -436,6 +436,16 @@ fn version_of_row(row: &[u8]) -> TrcVersion {
     }
 }
 
+/// Whether a line is a row, whatever is above it: of version 1, with its number and a bracket, or of version 2, whose number is followed by a time and
+/// one of its types.
+pub(super) fn is_row(line: &[u8]) -> bool {
+    let (number, rest) = text::word(line);
+    let is_v1 = number.strip_suffix(b")").is_some_and(|number| text::decimal(number).is_some());
+    let is_v2 = || text::decimal(number).is_some() && version_of_row(line) >= TrcVersion::V2_0;
+    let has_time = text::time_of_any_mark(text::word(rest).0, NS_PER_MS).is_some();
+    has_time && (is_v1 || is_v2()) && matches!(Decoder::default().row(line), Ok(Row::Record(_)))
+}
+
 /// Days since 1899-12-30 as nanoseconds since the Unix epoch, to a microsecond, which is as exact as the
 /// digits are.
 fn time_of_days(days: &[u8]) -> Option<i64> {

@@ -368,9 +368,12 @@ impl J1939 {
         if self.requests.is_empty() {
             return;
         }
+        // One that was already on its way when it was asked for; a single frame's stamp may be out of order.
+        let (is_long, start_ns) = (event.frames > 1, event.start_ns);
         let asked = self.requests.iter_mut().find(|request| {
             request.channel == channel
                 && request.pgn == pgn
+                && !(is_long && start_ns < request.time_ns)
                 && request.from != header.source
                 && (request.to == header.source || request.to == GLOBAL)
                 && (header.destination == GLOBAL || header.destination == request.from)

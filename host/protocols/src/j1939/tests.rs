@@ -118,6 +118,17 @@ fn requests_are_answered_or_not() {
     );
 }
 
+/// On a boat with two nodes of one address, times until the response were negative.
+#[test]
+fn what_was_on_its_way_when_it_was_asked_for_is_no_response() {
+    let again = DM1.map(|(ms, frame)| (ms + 200.0, frame));
+    let request = [(60.0, "18EA00F9#CAFE00")];
+    let said = event_lines(&[&DM1[..2], &request, &DM1[2..], &again].concat());
+    assert_eq!(said.len(), 3, "{said:?}");
+    assert!(!said[1].contains(", after"), "{said:?}");
+    assert!(said[2].ends_with(", after 140 ms"), "{said:?}");
+}
+
 #[test]
 fn addresses_are_claimed_and_lost() {
     let said = event_lines(&[

@@ -47,12 +47,12 @@ def conversations(
 
     `source`: what `read` takes, or a table of records, such as a device's batch. `filter` to `strict` are those of `read`, for files.
 
-    `protocol`: only these, on every channel, from beginning to end. Without it, each channel is read by the protocols that its first frames show, and by
-    others as soon as they show.
+    `protocol`: only these, on every channel, from beginning to end. Without it, each channel is read by the protocols that its first frames
+    show, and by others as soon as they show.
     `fields`: instead, a row for each field with one of these names, such as `"uds.did"`, `"obd.*"`, or `"*"` for all.
     `faults`: only what went wrong.
-    `db`: signals of the messages of J1939 and NMEA 2000. `pair`, `eds`, `odx`, `a2l`, `xcp`, `ccp`, `dsdl`, `subject`: what else is known about the bus, as
-    the command's options (docs/protocols.md). What is not understood in these files causes a `CantapWarning`.
+    `db`: signals of the messages of J1939 and NMEA 2000. `pair`, `eds`, `odx`, `a2l`, `xcp`, `ccp`, `dsdl`, `subject`: what else is known about
+    the bus, as the command's options (docs/protocols.md). What is not understood in these files causes a `CantapWarning`.
 
     The columns are in docs/python.md.
     """

@@ -228,8 +228,8 @@ class Device:
         dsdl: Paths = (),
         subject: Words = (),
     ) -> Iterator[Table]:
-        """Tables of what the frames of the last `seconds` or so mean, as from `cantap.conversations`, whose arguments these are, one after the other, until
-        the device is closed. None is empty.
+        """Tables of what the frames of the last `seconds` or so mean, as from `cantap.conversations`, whose arguments these are, one after the
+        other, until the device is closed. None is empty.
 
         Without `protocol`, the first three seconds show which protocols there are; what was said in them comes after that.
         """
@@ -505,12 +505,14 @@ def open(
     return device
 
 
-def selftest(address: str | None = None, *, loop: bool = False, load_time: Seconds = 5.0, restart: bool = False) -> dict[str, Any]:
-    """Tests what a board can show on its own, as `cantap selftest` does, and returns what that prints with `--json`: `passed`, and in `steps` the name, the outcome
-    and the figures of each. Without an address it is the board that is connected. It must not be open elsewhere.
+def selftest(
+    address: str | None = None, *, loop: bool = False, load_time: Seconds = 5.0, restart: bool = False
+) -> dict[str, Any]:
+    """Tests what a board can show on its own, as `cantap selftest` does, and returns what that prints with `--json`: `passed`, and in `steps`
+    the name, the outcome and the figures of each. Without an address it is the board that is connected. It must not be open elsewhere.
 
-    Without `loop` no channel puts a dominant bit on its bus, whatever is connected. With it, both channels send: channel 1 must be wired to channel 2, and
-    nothing else to them. `load_time`: how long each saturating load lasts. `restart`: restarts the firmware at the end.
+    Without `loop` no channel puts a dominant bit on its bus, whatever is connected. With it, both channels send: channel 1 must be wired to
+    channel 2, and nothing else to them. `load_time`: how long each saturating load lasts. `restart`: restarts the firmware at the end.
     """
     return _native.selftest(address, loop, load_time, restart)
 

@@ -291,8 +291,8 @@ def write(
     format: str | None = None,
     zone: str | None = None,
 ) -> dict[str, int]:
-    """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too. With `db` it writes the frames' signals, or
-    those that `signals` chooses, as an MCAP file for Foxglove, whose name ends in `.mcap`.
+    """Writes a table of records as a trace, in the format of the file's name or in `format`; `.parquet` works, too. With `db` it writes the
+    frames' signals, or those that `signals` chooses, as an MCAP file for Foxglove, whose name ends in `.mcap`.
 
     `table` comes from this package, also as a `scan`, which is never in memory as a whole, or anything else that exports Arrow, such as pandas and
     Polars; or it is a mapping of columns, or messages of python-can. Of the columns of `read` only

@@ -1,6 +1,8 @@
 """What a lake has of one trace."""
 
 import random
+import subprocess
+import sys
 
 import pytest
 
@@ -134,3 +136,9 @@ def test_files_have_the_rows_of_the_stream(tmp_path):
         of_table = stream.filter(pc.equal(stream.column("part"), table)).select(found.column_names)
         assert of_table.num_rows > 0 and found.sort_by("row").to_pylist() == of_table.sort_by("row").to_pylist()
     assert len({name.split("/")[2] for name in files["frames"]}) == 6
+
+
+def test_a_process_that_decodes_loads_no_more_than_it_needs():
+    """Each worker is one, and each trace that kills it costs another."""
+    program = "import sys, cantap.lake.decoding; print([name for name in ('pandas', 'pyarrow.dataset') if name in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=True, text=True).stdout == "[]\n"

@@ -9,11 +9,10 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 import pyarrow as pa
-import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from . import columns
@@ -21,6 +20,9 @@ from .joined import is_joined, members, part_of
 from .names import are_own, is_content
 from .transactions import Moves, Transactions, moved, write_whole
 from .writing import TABLES
+
+if TYPE_CHECKING:
+    import pyarrow.dataset
 
 #: In the second, files may be joined: who does not know that would see their rows several times.
 FORMAT, FORMAT_JOINED = 1, 2
@@ -215,6 +217,9 @@ class Store:
         """A table, `frames` or `signals`, of the traces in the ledger and nothing else."""
         if table not in TABLES:
             raise StoreError(f"a lake has no table '{table}'; it has {', '.join(TABLES)}")
+        # It brings pandas, if that is there: more than a second for each process that decodes, none of which has a use for it.
+        import pyarrow.dataset
+
         names = [str(self.path(name)) for name in self._files_as_said(table)]
         return pyarrow.dataset.dataset(names, schema=columns.schema(TABLES[table]), format="parquet")
 

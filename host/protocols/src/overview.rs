@@ -412,7 +412,7 @@ mod tests {
         let (_, node) = plant.nodes().next().unwrap();
         assert_eq!((node.state.as_deref(), node.missed), (Some("heartbeat missing"), 1));
         assert!(node.codes["emergency"].contains("0x2310"), "{:?}", node.codes);
-        assert_eq!((node.state_ns, node.drive), (Some(450_000_000), None));
+        assert_eq!((node.state_ns, node.drive), (Some(550_000_000), None));
         let drive = overview(
             Protocol::CanOpen,
             &[

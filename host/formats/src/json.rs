@@ -103,19 +103,16 @@ fn objects(text: &[u8]) -> impl Iterator<Item = Vec<Field>> {
                 Next::Object { start, end, inner } => {
                     let mut fields = object::fields(&text[at + start..at + end]);
                     let is_frame = |fields: &Vec<Field>| Decoder::default().is_frame(fields);
-                    match inner.filter(|_| !fields.as_ref().is_some_and(is_frame)) {
-                        Some(inner) => {
-                            around = Around::of(fields.clone().unwrap_or_default(), end - inner);
-                            (at, inside) = (at + inner, true);
+                    if let Some(inner) = inner.filter(|_| !fields.as_ref().is_some_and(is_frame)) {
+                        around = Around::of(fields.clone().unwrap_or_default(), end - inner);
+                        (at, inside) = (at + inner, true);
+                    } else {
+                        around.pass(start);
+                        if let Some(fields) = &mut fields {
+                            around.add_to(fields);
                         }
-                        None => {
-                            around.pass(start);
-                            if let Some(fields) = &mut fields {
-                                around.add_to(fields);
-                            }
-                            around.pass(end - start);
-                            at += end;
-                        }
+                        around.pass(end - start);
+                        at += end;
                     }
                     if let Some(fields) = fields {
                         return Some(fields);

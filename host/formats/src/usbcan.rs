@@ -337,7 +337,7 @@ mod tests {
         let source = std::io::Cursor::new(table);
         let mut reader =
             TraceReader::from_source("a.txt", source, Format::UsbCan, &ReadOptions::default()).unwrap();
-        assert_eq!(reader.by_ref().filter(Result::is_ok).count(), 2);
+        assert_eq!(reader.by_ref().flatten().count(), 2);
         assert_eq!(reader.notes().iter().collect::<Vec<_>>(), [(super::NO_STAMP, 1)]);
         let (log, issues) = as_log(table);
         assert_eq!(log, "(1.234500) can0 123#0102\n(1.234500) can0 18FEF100#03 T\n");

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
-use cantap_work::selftest::{Lines, Patience, Plan, Report, run as test};
+use cantap_work::selftest::{Patience, Report, ReportLines, TestPlan, run as test};
 use cantap_work::{atomic_file, interrupt};
 
 use crate::one_board::OneBoard;
@@ -51,10 +51,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let address = args.device.address()?;
     let device = address.open()?;
-    let shown = Lines::Shown { out: Box::new(std::io::stdout()), is_kept: args.report.is_some() };
-    let lines = if args.json { Lines::Kept } else { shown };
+    let shown = ReportLines::Shown { out: Box::new(std::io::stdout()), is_kept: args.report.is_some() };
+    let lines = if args.json { ReportLines::Kept } else { shown };
     let mut report = Report::new(&address, &device, lines, Patience::until(interrupt::requested));
-    let plan = Plan { has_loop: args.looped, load_time: args.load_time, restarts: args.restart };
+    let plan = TestPlan { has_loop: args.looped, load_time: args.load_time, restarts: args.restart };
     test(plan, &address, device, &mut report);
     if let Some(path) = &args.report {
         atomic_file::write(path, report.text()?.as_bytes())

@@ -8,7 +8,7 @@ mod decode;
 mod encode;
 mod layout;
 
-pub(crate) use decode::Decoder;
+pub(crate) use decode::{Decoder, is_head};
 pub(crate) use encode::Encoder;
 
 use cantap_can::{BusErrorKind, ErrorState, LossStage};
@@ -171,15 +171,6 @@ fn error_of(class: u32, position: u8, counters: (u8, u8)) -> TraceEvent {
         _ => None,
     };
     TraceEvent::BusError { kind, counters: Some(counters) }
-}
-
-/// Whether a text, and its first line, are those of such a file's head, or rows cut out of such a file.
-pub(crate) fn is_head(text: &[u8], line: &[u8]) -> bool {
-    decode::is_row(line)
-        || text.starts_with(b";$FILEVERSION")
-        || text.starts_with(b"$STARTTIME=")
-        || text.starts_with(b";####")
-        || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 //!
 //! A long trace has millions of them, so numbers are written without the machinery of `fmt`.
 
+use std::borrow::Cow;
 use std::fmt::{self, Write as _};
 
 use crate::event::{Event, Field, Party, Value};
@@ -37,6 +38,23 @@ impl Event {
         }
         if self.frames_lost {
             out.push_str("; frames were lost meanwhile");
+        }
+    }
+}
+
+impl Field {
+    /// What a table has beside the number: what the value stands for, or the value itself if it is a text, bytes as `0A F1`, or `not available`.
+    /// A text that stands for something is followed by that: `P0133 (O2 sensor slow response)`.
+    pub fn text_for_tables(&self) -> Option<Cow<'_, str>> {
+        let own = match &self.value {
+            Value::Text(text) => Some(Cow::Borrowed(&**text)),
+            Value::Bytes(bytes) => Some(hex(bytes).into()),
+            Value::Missing => Some("not available".into()),
+            Value::Number(_) | Value::Hex(..) | Value::Real(_) => None,
+        };
+        match (own, &self.text) {
+            (Some(own), Some(text)) => Some(format!("{own} ({text})").into()),
+            (own, text) => own.or_else(|| text.as_deref().map(Cow::Borrowed)),
         }
     }
 }

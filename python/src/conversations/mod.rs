@@ -25,7 +25,7 @@ use crate::table::{Table, batches_of};
 use crate::traces::{each_part, walk};
 
 /// What to read, as passed by the Python half.
-pub struct Wanted {
+pub struct WantedEvents {
     bus: BusOptions,
     rows: Rows,
     faults: bool,
@@ -39,7 +39,7 @@ fn parsed<T: FromStr<Err: ToString>>(options: Borrowed<'_, '_, PyAny>, name: &st
     Ok(values.map_err(|error| Error::argument(format!("{name}: {}", error.to_string())))?)
 }
 
-impl<'py> FromPyObject<'_, 'py> for Wanted {
+impl<'py> FromPyObject<'_, 'py> for WantedEvents {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
@@ -144,11 +144,11 @@ fn ended() -> Error {
 #[pymethods]
 impl Conversations {
     #[new]
-    fn new(py: Python<'_>, wanted: Wanted) -> PyResult<Self> {
+    fn new(py: Python<'_>, wanted: WantedEvents) -> PyResult<Self> {
         for note in &wanted.notes {
             warning(py, note)?;
         }
-        let Wanted { bus, rows, faults, .. } = wanted;
+        let WantedEvents { bus, rows, faults, .. } = wanted;
         let state = State {
             is_looking: bus.protocols.is_empty(),
             reader: Reader::new(bus),

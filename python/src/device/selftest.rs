@@ -4,7 +4,7 @@ use std::sync::{Arc, Mutex};
 
 use cantap_address::Address;
 use cantap_work::boards::the_one_connected;
-use cantap_work::selftest::{Lines, Patience, Plan, Report, run};
+use cantap_work::selftest::{Patience, Report, ReportLines, TestPlan, run};
 use pyo3::prelude::*;
 
 use super::lock::lock;
@@ -22,7 +22,7 @@ fn selftest(
     load_time: Seconds,
     restarts: bool,
 ) -> PyResult<Bound<'_, PyAny>> {
-    let plan = Plan { has_loop, load_time: duration(load_time)?, restarts };
+    let plan = TestPlan { has_loop, load_time: duration(load_time)?, restarts };
     if plan.load_time.is_zero() {
         return Err(Error::argument("load_time: a load lasts longer than 0 s").into());
     }
@@ -41,7 +41,7 @@ fn selftest(
             }
             raised.is_some()
         });
-        let mut report = Report::new(&address, &device, Lines::Kept, patience);
+        let mut report = Report::new(&address, &device, ReportLines::Kept, patience);
         run(plan, &address, device, &mut report);
         serde_json::to_string(&report).map_err(|error| Error::Address(error.to_string()))
     })?;

@@ -436,9 +436,18 @@ fn version_of_row(row: &[u8]) -> TrcVersion {
     }
 }
 
+/// Whether a text, and its first line, are those of such a file's head, or rows cut out of such a file.
+pub(crate) fn is_head(text: &[u8], line: &[u8]) -> bool {
+    is_row(line)
+        || text.starts_with(b";$FILEVERSION")
+        || text.starts_with(b"$STARTTIME=")
+        || text.starts_with(b";####")
+        || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
+}
+
 /// Whether a line is a row, whatever is above it: of version 1, with its number and a bracket, or of version 2, whose number is followed by a time and
 /// one of its types.
-pub(super) fn is_row(line: &[u8]) -> bool {
+fn is_row(line: &[u8]) -> bool {
     let (number, rest) = text::word(line);
     let is_v1 = number.strip_suffix(b")").is_some_and(|number| text::decimal(number).is_some());
     let is_v2 = || text::decimal(number).is_some() && version_of_row(line) >= TrcVersion::V2_0;

@@ -38,7 +38,7 @@ use rustc_hash::FxHashMap;
 use self::eds::Eds;
 use self::events::{event, malformed, nothing};
 use self::node::Bus;
-use self::safety::{Known, SafetySheets};
+use self::safety::{KnownSheets, SafetySheets};
 use self::sdo_channels::{SdoChannel, SdoChannels};
 pub(crate) use self::signs::CanOpenSigns;
 use self::states::{guard, heartbeat, sync};
@@ -173,7 +173,7 @@ impl CanOpen {
             LSS_MASTER => events.extend(bus.lss.request(record, data)),
             0x101..=0x180 if !bus.pdo_ids.contains_key(&id) => {
                 let sheet_of = |node| Self::sheet(sheets, node);
-                let known = Known { sheets: &self.sheet_safety, sheet_of: &sheet_of };
+                let known = KnownSheets { sheets: &self.sheet_safety, sheet_of: &sheet_of };
                 bus.safety.take(record, id, data, &known, events);
             }
             _ if node == 0 => {}
@@ -204,7 +204,7 @@ impl CanOpen {
         self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
         let from = events.len();
         let sheet_of = |node| Self::sheet(&self.sheets, node);
-        let known = Known { sheets: &self.sheet_safety, sheet_of: &sheet_of };
+        let known = KnownSheets { sheets: &self.sheet_safety, sheet_of: &sheet_of };
         for (&channel, bus) in &mut self.buses {
             bus.safety.sweep(channel, now_ns, &known, events);
             let event = |time_ns: i64, start_ns: i64, node: u8, kind, title: &'static str| Event {

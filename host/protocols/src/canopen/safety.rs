@@ -112,13 +112,13 @@ struct Srdo {
     frames_lost: bool,
 }
 
-/// What is needed besides the frames.
-pub struct Known<'a> {
+/// The sheets, by their safety parameters and by node.
+pub struct KnownSheets<'a> {
     pub sheets: &'a SafetySheets,
     pub sheet_of: &'a dyn Fn(u8) -> Option<&'a Eds>,
 }
 
-impl Known<'_> {
+impl KnownSheets<'_> {
     fn of(&self, id: u16) -> Option<Parameters> {
         self.sheets.0.get(&id).copied()
     }
@@ -172,7 +172,7 @@ impl Safety {
         record: &TraceRecord,
         id: u16,
         data: &[u8],
-        known: &Known<'_>,
+        known: &KnownSheets<'_>,
         events: &mut Vec<Event>,
     ) {
         if is_of_data(id) {
@@ -187,7 +187,7 @@ impl Safety {
         record: &TraceRecord,
         id: u16,
         data: &[u8],
-        known: &Known<'_>,
+        known: &KnownSheets<'_>,
         events: &mut Vec<Event>,
     ) {
         let srdo = self.0.entry(id).or_default();
@@ -210,7 +210,7 @@ impl Safety {
         record: &TraceRecord,
         id: u16,
         data: &[u8],
-        known: &Known<'_>,
+        known: &KnownSheets<'_>,
         events: &mut Vec<Event>,
     ) {
         let Some(srdo) = self.0.get_mut(&id) else { return };
@@ -267,7 +267,7 @@ impl Safety {
     }
 
     /// Says what has not come.
-    pub fn sweep(&mut self, channel: u8, now_ns: i64, known: &Known<'_>, events: &mut Vec<Event>) {
+    pub fn sweep(&mut self, channel: u8, now_ns: i64, known: &KnownSheets<'_>, events: &mut Vec<Event>) {
         for (&id, srdo) in &mut self.0 {
             let validation_ns = known.validation_ns(id);
             let is_missed = |(first, _): &mut (TraceRecord, Bytes)| {

@@ -9,7 +9,7 @@ use cantap::{Channel, Device, DeviceError, Frame};
 use serde_json::{Value, json};
 
 use super::patience::Patience;
-use super::report::Outcome;
+use super::report::StepOutcome;
 use super::traffic::{Amount, Flow, STAMP_TOLERANCE_US, exchange, forget, load_together_pct};
 use crate::rounded;
 
@@ -30,7 +30,7 @@ const PATIENCE: Duration = Duration::from_secs(3);
 /// How long to wait at a time.
 const GLANCE: Duration = Duration::from_millis(20);
 
-type Result = anyhow::Result<Outcome>;
+type Result = anyhow::Result<StepOutcome>;
 
 fn open(device: &Device, channel: Channel, bitrate_bps: u32, mode: Mode) -> anyhow::Result<()> {
     let config = ChannelConfig { mode, ..ChannelConfig::listen_only(device.timing(bitrate_bps)?) };
@@ -61,7 +61,7 @@ pub fn listen(patience: &Patience, device: &Device, channel: Channel) -> Result 
     );
     let measured = json!({ "frames": frames, "bus_errors": bus_errors, "tec": tec, "rec": rec });
     let holds = tec <= before.tec && transmitted == before.transmitted && seen.state != ErrorState::BusOff;
-    Ok(Outcome::of(holds, says, measured))
+    Ok(StepOutcome::of(holds, says, measured))
 }
 
 /// A channel in loopback inside the controller; its bus sees nothing. Then it is opened again, and its error counters are
@@ -90,7 +90,7 @@ pub fn alone(patience: &Patience, device: &Device, channel: Channel, bitrate_bps
     let mut measured = flow.measured();
     measured["tec_opened_again"] = again.tec.into();
     measured["rec_opened_again"] = again.rec.into();
-    Ok(Outcome::of(holds, says, measured))
+    Ok(StepOutcome::of(holds, says, measured))
 }
 
 fn is_clean(flow: &Flow) -> bool {
@@ -128,7 +128,7 @@ pub fn fill_queue(patience: &Patience, device: &Device, channel: Channel) -> Res
     let says = format!(
         "{queued} frames taken (the queue has {places}), then refused; {told} reported as withdrawn, in order"
     );
-    Ok(Outcome::of(holds, says, json!({ "queued": queued, "refused": refused, "told": told })))
+    Ok(StepOutcome::of(holds, says, json!({ "queued": queued, "refused": refused, "told": told })))
 }
 
 /// Both channels send as much as possible: each on its own bus, or both on one.
@@ -168,7 +168,7 @@ pub fn saturate(patience: &Patience, device: &Device, is_one_bus: bool, time: Du
         "queue_high_water_bytes": after.queue_high_water_bytes,
         "bus_full": is_full, "device_counts_agree": counted,
     });
-    Ok(Outcome::of(holds, says, measured))
+    Ok(StepOutcome::of(holds, says, measured))
 }
 
 /// Both channels send to each other.
@@ -195,7 +195,7 @@ pub fn cross(patience: &Patience, device: &Device, bitrate_bps: u32) -> Result {
     } else {
         ""
     };
-    Ok(Outcome::of(holds, format!("{}{hint}", lines.join("; ")), measured))
+    Ok(StepOutcome::of(holds, format!("{}{hint}", lines.join("; ")), measured))
 }
 
 /// One channel sends while the other only listens: nobody acknowledges, so the frame never ends, and the sender stops counting
@@ -242,5 +242,5 @@ pub fn unacknowledged(patience: &Patience, device: &Device, sender: Channel) -> 
         "tec_opened_again": again.tec, "rec_opened_again": again.rec,
         "seconds": rounded(started.elapsed().as_secs_f64(), 3),
     });
-    Ok(Outcome::of(holds, says, measured))
+    Ok(StepOutcome::of(holds, says, measured))
 }

@@ -14,12 +14,12 @@ use cantap::{Channel, Device};
 use cantap_address::{Address, OpenDevice};
 
 pub use self::patience::Patience;
-use self::report::Outcome;
-pub use self::report::{Lines, Report};
+use self::report::StepOutcome;
+pub use self::report::{Report, ReportLines};
 
 /// What to try.
 #[derive(Clone, Copy, Debug)]
-pub struct Plan {
+pub struct TestPlan {
     /// Channel 1 is wired to channel 2 and nothing else: both take part in the bus and send.
     pub has_loop: bool,
     /// How long each saturating load lasts.
@@ -32,14 +32,14 @@ pub struct Plan {
 const BITRATES_BPS: [u32; 4] = [1_000_000, 500_000, 250_000, 125_000];
 
 /// Tries everything; the results are in the report. Channels that are open are closed.
-pub fn run(plan: Plan, address: &Address, device: OpenDevice, report: &mut Report) {
+pub fn run(plan: TestPlan, address: &Address, device: OpenDevice, report: &mut Report) {
     test(plan, address, &device, report);
     restart(plan, address, device, report);
     report.finish();
 }
 
 /// All steps except the restart.
-fn test(plan: Plan, address: &Address, device: &Device, report: &mut Report) {
+fn test(plan: TestPlan, address: &Address, device: &Device, report: &mut Report) {
     // If something is wrong with it, that shows when it is read again.
     let saved = steps::saved(device).unwrap_or_default();
     report.step("identity", |_| Ok(steps::identity(device.hello())));
@@ -78,7 +78,7 @@ fn test(plan: Plan, address: &Address, device: &Device, report: &mut Report) {
         });
     } else {
         report.step("channel 1 to channel 2", |_| {
-            Ok(Outcome::Skip("they are not said to be wired to each other (--loop)".to_owned()))
+            Ok(StepOutcome::Skip("they are not said to be wired to each other (--loop)".to_owned()))
         });
     }
     report.step("clock", |patience| steps::clock(patience, address, device));
@@ -88,12 +88,12 @@ fn test(plan: Plan, address: &Address, device: &Device, report: &mut Report) {
     });
 }
 
-fn restart(plan: Plan, address: &Address, device: OpenDevice, report: &mut Report) {
+fn restart(plan: TestPlan, address: &Address, device: OpenDevice, report: &mut Report) {
     report.step("restart", move |patience| match (plan.restarts, address.may_come_back()) {
-        (false, _) => Ok(Outcome::Skip("it was not asked for (--restart)".to_owned())),
+        (false, _) => Ok(StepOutcome::Skip("it was not asked for (--restart)".to_owned())),
         (true, true) => steps::restart(patience, address, device),
         (true, false) => {
-            Ok(Outcome::Skip("this device lives in this process, and would end with it".to_owned()))
+            Ok(StepOutcome::Skip("this device lives in this process, and would end with it".to_owned()))
         }
     });
 }
@@ -105,12 +105,17 @@ mod tests {
 
     /// How often each channel put a dominant level on its bus.
     fn driven(has_loop: bool, options: &str) -> [u64; 2] {
-        let plan = Plan { has_loop, load_time: Duration::from_millis(100), restarts: false };
+        let plan = TestPlan { has_loop, load_time: Duration::from_millis(100), restarts: false };
         let connection = start(options.parse::<Options>().unwrap()).unwrap();
         let witness = std::sync::Arc::clone(&connection.witness);
         let device = Device::over(connection.into_link(), "virtual").unwrap();
         let address = "virtual".parse().unwrap();
-        test(plan, &address, &device, &mut Report::new(&address, &device, Lines::Kept, Patience::endless()));
+        test(
+            plan,
+            &address,
+            &device,
+            &mut Report::new(&address, &device, ReportLines::Kept, Patience::endless()),
+        );
         witness.activity().driven
     }
 
@@ -129,8 +134,8 @@ mod tests {
         let address = "virtual".parse().unwrap();
         let asked = std::sync::atomic::AtomicU32::new(0);
         let patience = Patience::until(move || asked.fetch_add(1, std::sync::atomic::Ordering::Relaxed) > 40);
-        let mut report = Report::new(&address, &device, Lines::Kept, patience);
-        let plan = Plan { has_loop: false, load_time: Duration::from_mins(1), restarts: false };
+        let mut report = Report::new(&address, &device, ReportLines::Kept, patience);
+        let plan = TestPlan { has_loop: false, load_time: Duration::from_mins(1), restarts: false };
         test(plan, &address, &device, &mut report);
         report.finish();
         assert!(report.was_cut_short() && !report.has_passed());

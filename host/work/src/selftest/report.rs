@@ -12,7 +12,7 @@ use cantap_address::Address;
 
 /// The result of a step.
 #[derive(Clone, Debug)]
-pub enum Outcome {
+pub enum StepOutcome {
     /// As expected: what was seen, and the figures.
     Pass(String, Value),
     /// Not as expected: what was seen, and the figures.
@@ -21,7 +21,7 @@ pub enum Outcome {
     Skip(String),
 }
 
-impl Outcome {
+impl StepOutcome {
     /// A pass if `holds` is true.
     pub fn of(holds: bool, says: String, measured: Value) -> Self {
         if holds { Self::Pass(says, measured) } else { Self::Fail(says, measured) }
@@ -55,7 +55,7 @@ pub struct Report {
     #[serde(skip)]
     started: Instant,
     #[serde(skip)]
-    lines: Lines,
+    lines: ReportLines,
     #[serde(skip)]
     patience: Patience,
     #[serde(skip)]
@@ -66,7 +66,7 @@ pub struct Report {
 }
 
 /// Where the lines go as the steps end.
-pub enum Lines {
+pub enum ReportLines {
     /// Nowhere: they are wanted at the end, or as an object.
     Kept,
     /// To an output. Nobody may read it any more; the report is made even so if it goes elsewhere, too.
@@ -87,7 +87,7 @@ pub enum Lines {
 
 impl Report {
     /// Nothing has been tested yet.
-    pub fn new(address: &Address, device: &Device, lines: Lines, patience: Patience) -> Self {
+    pub fn new(address: &Address, device: &Device, lines: ReportLines, patience: Patience) -> Self {
         let hello = device.hello();
         let [major, minor, patch] = hello.firmware;
         let mut report = Self {
@@ -115,23 +115,23 @@ impl Report {
 
     /// Performs a step. An error is a failure, and the next step is still tried: unless there is no connection any more, which is one
     /// failure, or Ctrl-C was pressed, or nobody wants the report.
-    pub(super) fn step(&mut self, name: &str, act: impl FnOnce(&Patience) -> anyhow::Result<Outcome>) {
+    pub(super) fn step(&mut self, name: &str, act: impl FnOnce(&Patience) -> anyhow::Result<StepOutcome>) {
         if self.interrupted || self.patience.is_over() {
             self.interrupted = true;
             return;
         }
-        if matches!(self.lines, Lines::Failed { is_kept: false, .. }) {
+        if matches!(self.lines, ReportLines::Failed { is_kept: false, .. }) {
             return;
         }
         self.busy.take_too_busy();
         let outcome = match &self.lost_in {
-            Some(step) => Ok(Outcome::Skip(format!("the connection was lost in the step '{step}'"))),
+            Some(step) => Ok(StepOutcome::Skip(format!("the connection was lost in the step '{step}'"))),
             None => act(&self.patience),
         };
         let outcome = match outcome {
             Err(error) if error.is::<Interrupted>() => {
                 self.interrupted = true;
-                Outcome::Skip("Ctrl-C ended it".to_owned())
+                StepOutcome::Skip("Ctrl-C ended it".to_owned())
             }
             Err(error) => {
                 if error.downcast_ref().is_some_and(ends_connection) {
@@ -139,19 +139,19 @@ impl Report {
                 }
                 match self.excuse() {
                     // No advice on what to do with the board.
-                    Some(excuse) => Outcome::Fail(format!("{error:#}{excuse}"), Value::Null),
-                    None => Outcome::Fail(crate::advice::sentence(&error), Value::Null),
+                    Some(excuse) => StepOutcome::Fail(format!("{error:#}{excuse}"), Value::Null),
+                    None => StepOutcome::Fail(crate::advice::sentence(&error), Value::Null),
                 }
             }
-            Ok(Outcome::Fail(says, measured)) => {
-                Outcome::Fail(says + self.excuse().unwrap_or_default().as_str(), measured)
+            Ok(StepOutcome::Fail(says, measured)) => {
+                StepOutcome::Fail(says + self.excuse().unwrap_or_default().as_str(), measured)
             }
             Ok(outcome) => outcome,
         };
         let (outcome, says, measured) = match outcome {
-            Outcome::Pass(says, measured) => ("pass", says, measured),
-            Outcome::Fail(says, measured) => ("FAIL", says, measured),
-            Outcome::Skip(says) => ("skip", says, Value::Null),
+            StepOutcome::Pass(says, measured) => ("pass", says, measured),
+            StepOutcome::Fail(says, measured) => ("FAIL", says, measured),
+            StepOutcome::Skip(says) => ("skip", says, Value::Null),
         };
         let step = Step { name: name.to_owned(), outcome, says, measured };
         self.show(&line(&step));
@@ -184,8 +184,8 @@ impl Report {
     pub fn output_error(self) -> Option<io::Error> {
         match self.lines {
             // `cantap … | head` has read enough, and the file has all of it.
-            Lines::Failed { is_kept: true, error } if error.kind() == io::ErrorKind::BrokenPipe => None,
-            Lines::Failed { error, .. } => Some(error),
+            ReportLines::Failed { is_kept: true, error } if error.kind() == io::ErrorKind::BrokenPipe => None,
+            ReportLines::Failed { error, .. } => Some(error),
             _ => None,
         }
     }
@@ -209,10 +209,10 @@ impl Report {
     }
 
     fn show(&mut self, text: &str) {
-        let Lines::Shown { out, is_kept } = &mut self.lines else { return };
+        let ReportLines::Shown { out, is_kept } = &mut self.lines else { return };
         let is_kept = *is_kept;
         if let Err(error) = out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-            self.lines = Lines::Failed { is_kept, error };
+            self.lines = ReportLines::Failed { is_kept, error };
         }
     }
 
@@ -269,16 +269,16 @@ mod tests {
     }
 
     /// The lines of a report in which one step fails, with a computer that holds the program up for this long meanwhile.
-    fn lines(held_up: Duration, error: impl FnOnce() -> anyhow::Result<Outcome>) -> String {
+    fn lines(held_up: Duration, error: impl FnOnce() -> anyhow::Result<StepOutcome>) -> String {
         let address: Address = "virtual:load=0".parse().unwrap();
         let device = address.open().unwrap();
-        let mut report = Report::new(&address, &device, Lines::Kept, Patience::endless());
+        let mut report = Report::new(&address, &device, ReportLines::Kept, Patience::endless());
         let computer = report.busy.busy_computer();
         report.step("round trips", |_| {
             computer(held_up);
             error()
         });
-        report.step("clock", |_| Ok(Outcome::Pass("steady".to_owned(), Value::Null)));
+        report.step("clock", |_| Ok(StepOutcome::Pass("steady".to_owned(), Value::Null)));
         report.steps.iter().map(line).collect()
     }
 
@@ -295,7 +295,7 @@ mod tests {
         );
         assert!(!busy.contains("unplug"), "{busy}");
         let busy =
-            lines(Duration::from_millis(800), || Ok(Outcome::Fail("99 of 100".to_owned(), Value::Null)));
+            lines(Duration::from_millis(800), || Ok(StepOutcome::Fail("99 of 100".to_owned(), Value::Null)));
         assert!(busy.starts_with("FAIL  round trips: 99 of 100; this computer was too busy"), "{busy}");
         assert!(busy.ends_with("pass  clock: steady\n"), "{busy}");
     }

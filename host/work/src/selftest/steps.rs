@@ -9,7 +9,7 @@ use cantap_address::{Address, OpenDevice};
 use serde_json::{Value, json};
 
 use super::patience::Patience;
-use super::report::Outcome;
+use super::report::StepOutcome;
 use crate::rounded;
 
 /// Number of requests for the device's time.
@@ -22,10 +22,10 @@ const CLOCK_PATIENCE: Duration = Duration::from_secs(12);
 /// How long a restarting firmware takes to be on USB again, however slow the computer.
 const RESTART_PATIENCE: Duration = Duration::from_secs(15);
 
-type Result<T = Outcome> = anyhow::Result<T>;
+type Result<T = StepOutcome> = anyhow::Result<T>;
 
 /// The device's description of itself.
-pub fn identity(hello: &Hello) -> Outcome {
+pub fn identity(hello: &Hello) -> StepOutcome {
     let holds = hello.protocol == PROTOCOL_VERSION
         && usize::from(hello.channels) == CHANNELS
         && hello.tick_hz >= 10_000_000
@@ -45,18 +45,18 @@ pub fn identity(hello: &Hello) -> Outcome {
         "trigger_slots": hello.trigger_slots, "filter_banks": hello.filter_banks,
         "capabilities": hello.capabilities,
     });
-    Outcome::of(holds, says, measured)
+    StepOutcome::of(holds, says, measured)
 }
 
 /// The system's description of its port.
 pub fn usb(address: &Address, hello: &Hello) -> Result {
     if !address.may_come_back() {
-        return Ok(Outcome::Skip("this device has no USB port".to_owned()));
+        return Ok(StepOutcome::Skip("this device has no USB port".to_owned()));
     }
     let port = address.to_string();
     let boards = cantap::device::list()?;
     let Some(board) = boards.into_iter().find(|board| board.port == port) else {
-        return Ok(Outcome::Skip(
+        return Ok(StepOutcome::Skip(
             "the system does not tell the USB IDs of this port, or they are not cantap's".to_owned(),
         ));
     };
@@ -64,7 +64,7 @@ pub fn usb(address: &Address, hello: &Hello) -> Result {
     let serial = board.serial_number.unwrap_or_else(|| "-".to_owned());
     let holds = serial == hello.serial.as_str();
     let measured = json!({ "product": product, "serial_number": serial });
-    Ok(Outcome::of(holds, format!("{product}, serial number {serial}"), measured))
+    Ok(StepOutcome::of(holds, format!("{product}, serial number {serial}"), measured))
 }
 
 /// How long answers take.
@@ -86,7 +86,7 @@ pub fn round_trips(patience: &Patience, device: &Device) -> Result {
     let says =
         format!("{ROUND_TRIPS}: at least {least} us, median {median}, 99 % {p99}, at most {most}{clock}");
     let measured = json!({ "count": ROUND_TRIPS, "least_us": least, "median_us": median, "p99_us": p99, "most_us": most });
-    Ok(Outcome::of(goes_on, says, measured))
+    Ok(StepOutcome::of(goes_on, says, measured))
 }
 
 /// How much faster the device's clock runs than this computer's.
@@ -103,10 +103,10 @@ pub fn clock(patience: &Patience, address: &Address, device: &Device) -> Result 
     let Some(ppm) = measured.map(|ppm| rounded(ppm, 2)) else {
         let why =
             "it could not be measured: the device does not run in real time, or this computer is too busy";
-        return Ok(Outcome::Skip(why.to_owned()));
+        return Ok(StepOutcome::Skip(why.to_owned()));
     };
     let says = format!("{ppm} ppm against this computer's");
-    Ok(Outcome::of(!is_bad(ppm), says, json!({ "drift_ppm": ppm })))
+    Ok(StepOutcome::of(!is_bad(ppm), says, json!({ "drift_ppm": ppm })))
 }
 
 /// What the device has stored for each channel.
@@ -118,13 +118,13 @@ pub fn saved(device: &Device) -> anyhow::Result<Vec<Option<Defaults>>> {
 }
 
 /// Whether what it has stored is the same as before.
-pub fn compare_saved(before: &[Option<Defaults>], now: &[Option<Defaults>]) -> Outcome {
+pub fn compare_saved(before: &[Option<Defaults>], now: &[Option<Defaults>]) -> StepOutcome {
     let what = now.iter().map(|saved| if saved.is_some() { "saved" } else { "nothing saved" });
     let says = format!("as before: channel 1 {}", what.collect::<Vec<_>>().join(", channel 2 "));
     if before == now {
-        Outcome::Pass(says, Value::Null)
+        StepOutcome::Pass(says, Value::Null)
     } else {
-        Outcome::Fail("they changed".to_owned(), Value::Null)
+        StepOutcome::Fail("they changed".to_owned(), Value::Null)
     }
 }
 
@@ -147,5 +147,5 @@ pub fn restart(patience: &Patience, address: &Address, device: OpenDevice) -> Re
     let uptime_s = device.time()? as f64 / f64::from(device.hello().tick_hz);
     let holds = device.hello().serial == serial && uptime_s < asked.elapsed().as_secs_f64();
     let says = format!("back after {seconds} s, and running for {uptime_s:.1} s");
-    Ok(Outcome::of(holds, says, json!({ "seconds": seconds, "uptime_s": rounded(uptime_s, 2) })))
+    Ok(StepOutcome::of(holds, says, json!({ "seconds": seconds, "uptime_s": rounded(uptime_s, 2) })))
 }

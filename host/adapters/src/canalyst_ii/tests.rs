@@ -25,6 +25,8 @@ struct State {
     lies: Option<u32>,
     answers_garbage: bool,
     is_unplugged: bool,
+    /// It takes no transfer any more: each ends after a while.
+    is_stalled: bool,
     /// It vanishes once so many transfers were made.
     vanishes_after: Option<u32>,
 }
@@ -66,6 +68,11 @@ impl StandIn {
             if *left == 0 {
                 state.is_unplugged = true;
             }
+        }
+        if state.is_stalled {
+            drop(state);
+            std::thread::sleep(Duration::from_millis(20));
+            return Err("the transfer took too long".to_owned());
         }
         if state.is_unplugged { Err("it was unplugged".to_owned()) } else { Ok(state) }
     }
@@ -201,6 +208,19 @@ fn one_that_vanishes_at_any_moment_is_an_error_and_no_hang() {
             assert!(end.to_string().contains("it was unplugged"), "{end}");
         }
     }
+}
+
+#[test]
+fn one_that_answers_no_more_ends_with_a_reason_and_nothing_captured_is_lost() {
+    let stand_in = StandIn::default();
+    let device = session(&stand_in);
+    device.join(Channel::Can1, 500_000).unwrap();
+    stand_in.receive(0, 1, &["100#", "101#"]);
+    until(&device, "101#");
+    stand_in.lock().is_stalled = true;
+    let end = device.records().find_map(Result::err).unwrap();
+    assert!(end.to_string().contains("took too long"), "{end}");
+    assert_eq!(device.counters().channels[0].received, 2);
 }
 
 #[test]

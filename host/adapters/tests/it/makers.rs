@@ -32,6 +32,8 @@ enum Set {
     Occupied = 5,
     Features = 6,
     Room = 7,
+    Babbles = 8,
+    Hangs = 9,
 }
 
 /// What [`StandIn::get`] reads.
@@ -340,6 +342,57 @@ fn kvaser_fd_and_a_pulled_adapter() {
     library.set(Set::Unplugged, 1);
     let end = device.records().find_map(Result::err).unwrap().to_string();
     assert!(end.contains("Hardware error"), "{end}");
+}
+
+/// Both makers' libraries, each with the address of its adapter.
+fn both() -> impl Iterator<Item = (StandIn, String)> {
+    [("pcanbasic", "pcan:"), ("canlib", "kvaser:0")].into_iter().filter_map(|(name, channel)| {
+        let library = StandIn::new(name)?;
+        let address = library.address(channel, "");
+        Some((library, address))
+    })
+}
+
+/// There is always another message, and every other one is no frame.
+#[test]
+fn libraries_that_never_run_out_of_messages_hold_up_no_request_and_what_has_no_room_is_counted() {
+    for (library, address) in both() {
+        let device = crate::open(&address);
+        device.listen(Channel::Can1, 500_000).unwrap();
+        library.set(Set::Babbles, 1);
+        let mut count = 0;
+        until(&device, |record| {
+            count += u32::from(record.frame().is_some());
+            count == 5000
+        });
+        for _ in 0..10 {
+            device.status().unwrap();
+        }
+        assert!(device.failures().unwrap().last.contains("messages that are no frames"), "{address}");
+        device.stop().unwrap();
+        library.set(Set::Babbles, 0);
+        assert_eq!(library.get(Get::IsOnBus), 0, "{address}");
+        let counters = device.counters().channels[0];
+        assert!(counters.lost_link + counters.lost_queue > 1000, "{address}: {counters:?}");
+    }
+}
+
+/// A call that does not come back cannot be ended: whoever waits is told, and goes on once it has.
+#[test]
+fn libraries_that_hang_are_an_error_and_lose_nothing_that_was_captured() {
+    for (library, address) in both() {
+        let device = crate::open(&address);
+        device.listen(Channel::Can1, 500_000).unwrap();
+        library.receive(0x123, 2, 1, &[1], 1_000_000);
+        until(&device, |record| record.frame().is_some());
+        library.set(Set::Hangs, 1);
+        let error = device.status().unwrap_err().to_string();
+        assert!(error.contains("answered nothing"), "{error}");
+        library.set(Set::Hangs, 0);
+        assert_eq!(device.counters().channels[0].received, 1, "{address}");
+        drop(device);
+        assert_eq!(library.get(Get::IsOnBus), 0, "{address}");
+    }
 }
 
 /// A classical frame beside it stays one, and without a data bit rate nothing of CAN FD is sent.

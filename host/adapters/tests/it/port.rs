@@ -1,7 +1,8 @@
 //! A serial port with a stand-in at its other end.
 
 use std::fs::File;
-use std::io::{ErrorKind, Read};
+use std::io::{self, ErrorKind, Read};
+use std::net::{SocketAddr, TcpListener};
 use std::os::fd::OwnedFd;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -54,6 +55,20 @@ impl Port {
             }
         });
         Self { path, other_end: port, user, pulled, thread }
+    }
+
+    /// Passes on what one client writes, and what the stand-in says.
+    pub fn serve(&self) -> SocketAddr {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let port = File::options().read(true).write(true).open(&self.path).unwrap();
+        std::thread::spawn(move || {
+            let Ok((client, _)) = listener.accept() else { return };
+            let (mut from_client, mut to_port) = (client.try_clone().unwrap(), port.try_clone().unwrap());
+            std::thread::spawn(move || io::copy(&mut from_client, &mut to_port));
+            let _ = io::copy(&mut &port, &mut &client);
+        });
+        address
     }
 
     /// It is gone, with its other end.

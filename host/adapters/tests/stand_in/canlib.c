@@ -5,6 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
+#include <unistd.h>
 
 enum { OK = 0, PARAM = -1, NOMSG = -2, INVHANDLE = -10, TXBUFOFL = -13, HARDWARE = -15, NO_ACCESS = -31 };
 
@@ -13,7 +14,9 @@ typedef struct { long id; unsigned len, flags; unsigned long time; uint8_t data[
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static Message queue[4096];
 static unsigned head, tail, sent_count, room = 64, last_sent, last_flags, last_len, output = 4, bits, transmit_acknowledge, scale = 1000;
-static int open_handle, on_bus, unplugged, deaf, occupied;
+static int open_handle, on_bus, unplugged, deaf, occupied, babbles;
+static volatile int hangs;
+static unsigned babbled;
 static long bitrate, data_bitrate;
 static unsigned segments[3];
 
@@ -100,8 +103,13 @@ int canIoCtl(int handle, unsigned function, void *buffer, unsigned len) {
 int canRead(int handle, long *id, void *data, unsigned *len, unsigned *flags, unsigned long *time) {
     int status = check(handle);
     if (status) return status;
+    while (hangs) usleep(1000);
     pthread_mutex_lock(&lock);
-    if (head == tail || (began_us && began_us + queue[tail % 4096].time > now_us())) {
+    if (babbles) {
+        /* A frame, and something with a length that no frame has, in turn. */
+        *id = (long)(babbled % 0x700); *len = babbled & 1 ? 77 : 0; *flags = 2; *time = now_us() / scale;
+        babbled++;
+    } else if (head == tail || (began_us && began_us + queue[tail % 4096].time > now_us())) {
         status = NOMSG;
     } else {
         Message *m = &queue[tail++ % 4096];
@@ -163,6 +171,8 @@ void standin_set(uint32_t what, uint32_t value) {
         case 3: deaf = (int)value; break; /* to the wish to be silent */
         case 5: occupied = (int)value; break;
         case 7: room = value; break;
+        case 8: babbles = (int)value; break;
+        case 9: hangs = (int)value; break; /* in a read, until it is told otherwise */
     }
 }
 

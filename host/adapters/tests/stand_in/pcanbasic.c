@@ -27,7 +27,9 @@ static unsigned head, tail;
 static MsgFd sent[64];
 static unsigned sent_count, room = 64;
 static uint32_t values[256], bus_status, read_status;
-static int initialized, unplugged, deaf, knows_echoes = 1, occupied;
+static int initialized, unplugged, deaf, knows_echoes = 1, occupied, babbles;
+static volatile int hangs;
+static unsigned babbled;
 static char timing[512];
 static uint16_t registers;
 
@@ -99,9 +101,18 @@ uint32_t CAN_GetStatus(uint16_t channel) {
 static uint32_t next(uint16_t channel, MsgFd *msg, uint64_t *us) {
     if (channel != USBBUS1 || unplugged) return ILLHW;
     if (!initialized) return INITIALIZE;
+    while (hangs) usleep(1000);
     pthread_mutex_lock(&lock);
     uint32_t status = read_status;
     read_status = 0;
+    if (babbles) {
+        /* A frame, and something with a length that no frame has, in turn. */
+        *msg = (MsgFd){ .id = babbled % 0x700, .dlc = babbled & 1 ? 77 : 0 };
+        *us = now_us();
+        babbled++;
+        pthread_mutex_unlock(&lock);
+        return OK;
+    }
     if (!status && (head == tail || (began_us && began_us + queue[tail % 4096].us > now_us()))) status = QRCVEMPTY;
     if (!status) { *msg = queue[tail % 4096].msg; *us = queue[tail++ % 4096].us; }
     if (tail == 50 && is("vanishes")) unplugged = 1;
@@ -220,6 +231,8 @@ void standin_set(uint32_t what, uint32_t value) {
         case 5: occupied = (int)value; break;      /* 1: visibly, 2: when it is opened */
         case 6: values[0x16] = value; break;       /* features */
         case 7: room = value; break;
+        case 8: babbles = (int)value; break;
+        case 9: hangs = (int)value; break;         /* in a read, until it is told otherwise */
     }
     pthread_mutex_unlock(&lock);
 }

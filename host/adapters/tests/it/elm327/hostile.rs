@@ -45,26 +45,34 @@ fn one_that_has_started_again_ends_the_session_since_its_settings_are_gone() {
     }
 }
 
+/// Each of them, on a serial port and behind a server.
+fn everywhere(elm: Chip, stn: Chip) -> impl Iterator<Item = StandIn> {
+    [StandIn::start(elm), StandIn::start_on_tcp(elm), StandIn::start(stn), StandIn::start_on_tcp(stn)]
+        .into_iter()
+}
+
 #[test]
 fn babbling_is_counted_and_costs_no_memory_and_no_silence() {
-    let adapter = StandIn::start(Chip::Elm);
-    let device = open(&adapter.address());
-    device.listen(Channel::Can1, 500_000).unwrap();
-    for _ in 0..256 {
-        adapter.says(&"x".repeat(1024));
+    for adapter in everywhere(Chip::Elm, Chip::Stn) {
+        let address = adapter.address();
+        let device = open(&address);
+        device.listen(Channel::Can1, 500_000).unwrap();
+        for _ in 0..256 {
+            adapter.says(&"x".repeat(1024));
+        }
+        // Lengths and identifiers that lie, prompts without an end, and what pretends to be several things.
+        adapter.says("\r800\r7E8F\r7E8064100BE3EA8130000\r\0\x07\r");
+        for _ in 0..64 {
+            adapter.says(&">".repeat(1024));
+        }
+        adapter.says(if address.starts_with("stn") { "\r7FF0\r" } else { "\r7FF\r" });
+        let records = until_frame(&device, "7FF#");
+        let link = losses(&records).iter().filter(|(stage, _)| *stage == "link").count();
+        assert!((5..100).contains(&link), "{address}: {link}");
+        assert!(gaps(&records).len() < 200);
+        // Each prompt might be the answer to a command: it is told to go on no more often than it is looked at.
+        assert!(device.failures().unwrap().last.contains("prompts"));
     }
-    // Lengths and identifiers that lie, prompts without an end, and what pretends to be several things.
-    adapter.says("\r800\r7E80\r7E8064100BE3EA8130000\r\0\x07\r");
-    for _ in 0..64 {
-        adapter.says(&">".repeat(1024));
-    }
-    adapter.says("\r7FF\r");
-    let records = until_frame(&device, "7FF#");
-    let link = losses(&records).iter().filter(|(stage, _)| *stage == "link").count();
-    assert!((5..100).contains(&link), "{link}");
-    assert!(gaps(&records).len() < 200);
-    // Each prompt might be the answer to a command: it is told to go on no more often than it is looked at.
-    assert!(device.failures().unwrap().last.contains("prompts"));
 }
 
 #[test]
@@ -160,28 +168,34 @@ fn one_that_vanishes_at_any_moment_is_an_error_and_no_hang() {
 #[test]
 fn one_that_stops_and_never_prompts_is_asked_and_then_given_up() {
     // It prompts when it is asked.
-    let adapter = StandIn::start(Chip::Elm);
-    let device = open(&adapter.address());
-    device.listen(Channel::Can1, 500_000).unwrap();
-    adapter.bus(&["100#"]);
-    adapter.state.lock().unwrap().monitors = false;
-    adapter.says("BUFFER FULL\r");
-    adapter.bus(&["7FF#"]);
-    let records = until_frame(&device, "7FF#");
-    assert_eq!(
-        (frames(&records), gaps(&records)),
-        (vec!["100#".to_owned(), "7FF#".to_owned()], vec![("queue", 0, true)])
-    );
-    assert!(device.failures().unwrap().last.contains("prompts that did not come"));
+    for adapter in everywhere(Chip::Elm, Chip::Stn) {
+        let device = open(&adapter.address());
+        device.listen(Channel::Can1, 500_000).unwrap();
+        adapter.bus(&["100#"]);
+        adapter.state.lock().unwrap().monitors = false;
+        adapter.says("BUFFER FULL\r");
+        adapter.bus(&["7FF#"]);
+        let records = until_frame(&device, "7FF#");
+        assert_eq!(
+            (frames(&records), gaps(&records)),
+            (vec!["100#".to_owned(), "7FF#".to_owned()], vec![("queue", 0, true)])
+        );
+        assert!(device.failures().unwrap().last.contains("prompts that did not come"));
+    }
     // It does not.
-    let adapter = StandIn::start(Chip::Stuck);
-    let device = open(&adapter.address());
-    device.listen(Channel::Can1, 500_000).unwrap();
-    adapter.bus(&["100#"]);
-    adapter.says("BUFFER FULL\r");
-    let end = device.records().find_map(Result::err).unwrap();
-    assert!(end.to_string().contains("no longer answers"), "{end}");
-    assert_eq!(device.counters().channels[0].received, 1);
+    std::thread::scope(|scope| {
+        for adapter in everywhere(Chip::Stuck, Chip::StuckStn) {
+            scope.spawn(move || {
+                let device = open(&adapter.address());
+                device.listen(Channel::Can1, 500_000).unwrap();
+                adapter.bus(&["100#"]);
+                adapter.says("BUFFER FULL\r");
+                let end = device.records().find_map(Result::err).unwrap();
+                assert!(end.to_string().contains("no longer answers"), "{end}");
+                assert_eq!(device.counters().channels[0].received, 1);
+            });
+        }
+    });
 }
 
 /// Half a line, and long afterwards its end; digits, prompts and zeros of a line at the wrong speed.

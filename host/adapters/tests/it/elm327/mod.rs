@@ -4,7 +4,7 @@ mod hostile;
 mod listening;
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -38,6 +38,18 @@ enum Chip {
     Twice,
     /// STN1110.
     Stn,
+    /// The same, which never stops monitoring.
+    StuckStn,
+}
+
+impl Chip {
+    fn is_stn(self) -> bool {
+        matches!(self, Self::Stn | Self::StuckStn)
+    }
+
+    fn is_stuck(self) -> bool {
+        matches!(self, Self::Stuck | Self::StuckStn)
+    }
 }
 
 /// Its settings, all as after a start.
@@ -85,7 +97,7 @@ impl State {
 
     fn byte(&mut self, byte: u8) -> Vec<u8> {
         if self.monitors {
-            if self.chip == Chip::Stuck {
+            if self.chip.is_stuck() {
                 return Vec::new();
             }
             self.monitors = false;
@@ -114,7 +126,7 @@ impl State {
     /// `None` while it monitors.
     fn answer(&mut self, line: &str) -> Option<String> {
         let chip = self.chip;
-        let stn = chip == Chip::Stn;
+        let stn = chip.is_stn();
         let ok = Some("OK".to_owned());
         let unknown = Some("?".to_owned());
         match line {
@@ -188,7 +200,7 @@ impl State {
     fn print(&self, text: &str) -> String {
         let frame: Frame = text.parse().unwrap();
         let passes = match self.chip {
-            Chip::Stn => self.passes_all,
+            Chip::Stn | Chip::StuckStn => self.passes_all,
             _ if self.protocol == 'B' => self.both_ids || !frame.id().is_extended(),
             _ => frame.id().is_extended() == matches!(self.protocol, '7' | '9'),
         };
@@ -212,6 +224,8 @@ impl State {
 
 struct StandIn {
     port: Port,
+    /// Where its port is served.
+    server: Option<SocketAddr>,
     state: Arc<Mutex<State>>,
 }
 
@@ -219,12 +233,22 @@ impl StandIn {
     fn start(chip: Chip) -> Self {
         let state = Arc::new(Mutex::new(State::new(chip)));
         let own = Arc::clone(&state);
-        Self { port: Port::start(move |byte| own.lock().unwrap().byte(byte)), state }
+        Self { port: Port::start(move |byte| own.lock().unwrap().byte(byte)), server: None, state }
+    }
+
+    /// The same behind a server, as those with Wi-Fi are.
+    fn start_on_tcp(chip: Chip) -> Self {
+        let adapter = Self::start(chip);
+        let server = Some(adapter.port.serve());
+        Self { server, ..adapter }
     }
 
     fn address(&self) -> String {
-        let scheme = if self.state.lock().unwrap().chip == Chip::Stn { "stn" } else { "elm327" };
-        format!("{scheme}:{}", self.port.path)
+        let scheme = if self.state.lock().unwrap().chip.is_stn() { "stn" } else { "elm327" };
+        match self.server {
+            Some(server) => format!("{scheme}:tcp://{server}"),
+            None => format!("{scheme}:{}", self.port.path),
+        }
     }
 
     /// These frames are on its bus.

@@ -193,15 +193,7 @@ impl Safety {
         let srdo = self.0.entry(id).or_default();
         srdo.is_known |= known.of(id).is_some();
         if let Some((first, data)) = srdo.open.replace((*record, Bytes::from_slice(data))) {
-            if srdo.is_known {
-                let mut event = known.event(&first, id);
-                event.fields.push(Field::bytes("data", &data));
-                event.trouble = Some(Trouble::Overlapped);
-                event.frames_lost = std::mem::take(&mut srdo.frames_lost);
-                events.push(event);
-            } else {
-                srdo.forget();
-            }
+            srdo.half(|| known.event(&first, id), Field::bytes("data", &data), Trouble::Overlapped, events);
         }
     }
 
@@ -215,15 +207,7 @@ impl Safety {
     ) {
         let Some(srdo) = self.0.get_mut(&id) else { return };
         let Some((first, plain)) = srdo.open.take() else {
-            if srdo.is_known {
-                let mut event = known.event(record, id);
-                event.fields.push(Field::bytes("inverse", data));
-                event.trouble = Some(Trouble::Headless);
-                event.frames_lost = std::mem::take(&mut srdo.frames_lost);
-                events.push(event);
-            } else {
-                srdo.forget();
-            }
+            srdo.half(|| known.event(record, id), Field::bytes("inverse", data), Trouble::Headless, events);
             return;
         };
         let after_ns = record.time_ns.saturating_sub(first.time_ns);
@@ -274,16 +258,13 @@ impl Safety {
                 now_ns.saturating_sub(first.time_ns) > MISSED_TIMES * validation_ns
             };
             if let Some((first, data)) = srdo.open.take_if(is_missed) {
-                if srdo.is_known {
+                let late = || {
                     let mut event = known.event(&first, id);
                     event.time_ns = first.time_ns + validation_ns;
-                    event.fields.push(Field::bytes("data", &data));
-                    event.trouble = Some(Trouble::Timeout { after_ms: (validation_ns / 1_000_000) as u32 });
-                    event.frames_lost = std::mem::take(&mut srdo.frames_lost);
-                    events.push(event);
-                } else {
-                    srdo.forget();
-                }
+                    event
+                };
+                let trouble = Trouble::Timeout { after_ms: (validation_ns / 1_000_000) as u32 };
+                srdo.half(late, Field::bytes("data", &data), trouble, events);
             }
             let cycle_ns = known.of(id).map_or(0, |of| i64::from(of.cycle_ms) * 1_000_000);
             if let Some(latest_ns) = srdo.latest_ns
@@ -315,6 +296,25 @@ impl Safety {
 }
 
 impl Srdo {
+    /// One frame of a pair came without the other: that is said if the pair is known, and otherwise it is none.
+    fn half(
+        &mut self,
+        event: impl FnOnce() -> Event,
+        frame: Field,
+        trouble: Trouble,
+        events: &mut Vec<Event>,
+    ) {
+        if !self.is_known {
+            self.forget();
+            return;
+        }
+        let mut event = event();
+        event.fields.push(frame);
+        event.trouble = Some(trouble);
+        event.frames_lost = std::mem::take(&mut self.frames_lost);
+        events.push(event);
+    }
+
     /// What came is no pair, and nothing was said of it.
     fn forget(&mut self) {
         self.held.clear();

@@ -239,6 +239,10 @@ capture_is_exact() {
   exact "$1"
 }
 
+# captures INTERFACE: a capture receives from it. Only its socket asks for error frames: the one through which it looks at the interface first, and
+# which it closes again, does not.
+captures() { grep -q "^ *$1 .* raw *$" /proc/net/can/rcvlist_err; }
+
 # of_channel N: frames delivered and frames counted lost, from the capture's summary.
 of_channel() { sed "s/.*\"channel\":$1,\"frames\":\([0-9]*\),\"lost\":\([0-9]*\).*/\1 \2/" capture.json; }
 

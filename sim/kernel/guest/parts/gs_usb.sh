@@ -94,7 +94,7 @@ grep -q "controller's hardware clock" info.txt && grep -q "accepted by the adapt
 verdict $? "gs_usb, kernel: hardware stamps, that an echo proves nothing, and the mode are in the row"
 
 gs_start -d can0
-wait_until receives can0 1
+wait_until captures can0
 candump -L -r 8000000 can0 > dump.txt &
 CANDUMP=$!
 wait_until receives can0 2
@@ -147,7 +147,7 @@ verdict $? "gs_usb, kernel: on an interface that only listens nothing is sent" "
 # Pulled out behind the kernel's driver, plugged in again, and set up by the command: the capture goes on.
 can_is_up can1 off
 gs_start -d can0
-wait_until receives can0 1
+wait_until captures can0
 cansend can1 001#
 is_in_capture() { grep -q " $1" capture.log; }
 wait_until is_in_capture 001#
@@ -158,7 +158,7 @@ wait_until has_no_gs
 gs_attach && wait_until has_interface can1
 "$CANTAP" interface can1 -b 500k --mode normal > set.txt 2>&1 && "$CANTAP" interface can0 -b 500k --mode normal >> set.txt 2>&1
 verdict $? "gs_usb, kernel: it is back, and set up again"
-wait_until has_told "the device is back after" && wait_until receives can0 1 && cansend can1 002# && wait_until is_in_capture 002# && gs_end &&
+wait_until has_told "the device is back after" && wait_until captures can0 && cansend can1 002# && wait_until is_in_capture 002# && gs_end &&
   grep -q '"gaps":{"count":1,' capture.json
 verdict $? "gs_usb, kernel: the capture continues, and has the gap" "$(frames_on can0 capture.log | tr '\n' ' ')"
 

@@ -13,7 +13,7 @@ capture_bus() {
   rm -f capture.log capture.json
   "$CANTAP" capture -d socketcan:$BUS -o capture.log --json "$@" > capture.json 2> capture.err &
   CAPTURE=$!
-  wait_until is_bound 1 || { cat capture.err; return 1; }
+  wait_until captures $BUS || { cat capture.err; return 1; }
 }
 # end_capture CODE
 end_capture() {
@@ -116,7 +116,7 @@ _frames=20000
   exec /usr/bin/setpriv --reuid 1000 --clear-groups "$CANTAP" capture -d socketcan:$BUS -b 1M -o capture.log --json > ../capture.json 2> ../capture.err
 ) &
 CAPTURE=$!
-wait_until is_bound 1
+wait_until captures $BUS
 cangen -g 0 -n $((_frames / 2)) -I 123 -L 8 -D i $BUS &
 _generator=$!
 sleep 0.2
@@ -181,7 +181,7 @@ ip link set $BUS down
 wait_until has_told "taken down"
 verdict $? "socketcan: an interface that is taken down is reported, with the line for root"
 ip link set $BUS up
-wait_until has_told "the device is back after" && wait_until is_bound 1 && cansend $BUS 002# && sleep 1 && end_capture 0 &&
+wait_until has_told "the device is back after" && wait_until captures $BUS && cansend $BUS 002# && sleep 1 && end_capture 0 &&
   [ "$(bare_frames capture.log | tr '\n' ' ')" = "001# 002# " ] && grep -q '"gaps":{"count":1,' capture.json
 verdict $? "socketcan: the capture continues when it is up again, and has the gap" "$(bare_frames capture.log | tr '\n' ' ')"
 capture_bus -b 500k

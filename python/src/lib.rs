@@ -13,6 +13,10 @@ mod frame;
 mod grammar;
 mod inputs;
 mod messages;
+#[cfg(feature = "scripts")]
+mod nodes;
+#[cfg(not(feature = "scripts"))]
+#[path = "no_nodes.rs"]
 mod nodes;
 mod number;
 mod numpy;
@@ -25,12 +29,19 @@ mod traces;
 mod values;
 mod write;
 
+#[cfg(feature = "scripts")]
 use cantap_scripts::Counting;
 use mimalloc::MiMalloc;
 use pyo3::prelude::*;
 
 /// Columns are megabytes that are freed and wanted again. The system's allocator returns them to the kernel each time, and getting them back page by
-/// page took a quarter of the time of decoding. Counted for scripts, whose memory is limited.
+/// page took a quarter of the time of decoding.
+#[cfg(not(feature = "scripts"))]
+#[global_allocator]
+static ALLOCATOR: MiMalloc = MiMalloc;
+
+/// The same, counted for scripts, whose memory is limited.
+#[cfg(feature = "scripts")]
 #[global_allocator]
 static ALLOCATOR: Counting<MiMalloc> = Counting(MiMalloc);
 

@@ -8,11 +8,14 @@ use std::sync::Arc;
 use arrow_array::ffi::FFI_ArrowSchema;
 use arrow_array::ffi_stream::{FFI_ArrowArrayStream, RecordBatchStreamReader};
 use arrow_array::{
-    Array, ArrayRef, RecordBatch, RecordBatchIterator, RecordBatchReader, StructArray, new_empty_array,
+    Array, ArrayRef, RecordBatch, RecordBatchIterator, RecordBatchOptions, RecordBatchReader, StructArray,
+    make_array, new_empty_array,
 };
+use arrow_data::ArrayData;
+use arrow_data::transform::MutableArrayData;
 use arrow_ipc::reader::StreamReader;
 use arrow_ipc::writer::StreamWriter;
-use arrow_schema::{ArrowError, SchemaRef};
+use arrow_schema::{ArrowError, DataType, SchemaRef};
 use cantap_trace::counted;
 use pyo3::exceptions::{PyAttributeError, PyKeyError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
@@ -321,7 +324,7 @@ impl Table {
             [] => Ok(new_empty_array(self.schema.field(place).data_type())),
             batches => {
                 let pieces: Vec<_> = batches.iter().map(|batch| batch.column(place).as_ref()).collect();
-                arrow_select::concat::concat(&pieces).map_err(arrow_error)
+                joined(&pieces).map_err(arrow_error)
             }
         }
     }
@@ -330,9 +333,38 @@ impl Table {
     pub fn one_batch(&self) -> PyResult<RecordBatch> {
         match self.batches.as_slice() {
             [batch] => Ok(batch.clone()),
-            batches => arrow_select::concat::concat_batches(&self.schema, batches).map_err(arrow_error),
+            batches => {
+                let columns = (0..self.schema.fields().len()).map(|place| {
+                    let pieces: Vec<_> = batches.iter().map(|batch| batch.column(place).as_ref()).collect();
+                    if pieces.is_empty() {
+                        Ok(new_empty_array(self.schema.field(place).data_type()))
+                    } else {
+                        joined(&pieces)
+                    }
+                });
+                let columns = columns.collect::<Result<_, _>>().map_err(arrow_error)?;
+                let rows = batches.iter().map(RecordBatch::num_rows).sum();
+                let options = RecordBatchOptions::new().with_row_count(Some(rows));
+                RecordBatch::try_new_with_options(Arc::clone(&self.schema), columns, &options)
+                    .map_err(arrow_error)
+            }
         }
     }
+}
+
+/// The pieces of a column as one. Those of a dictionary, which may have different texts, are `arrow-select`'s business; the rest is copied here, because
+/// that crate is not optimised (see `profile.wheel` in the workspace's Cargo.toml).
+fn joined(pieces: &[&dyn Array]) -> Result<ArrayRef, ArrowError> {
+    if pieces.iter().any(|piece| matches!(piece.data_type(), DataType::Dictionary(..))) {
+        return arrow_select::concat::concat(pieces);
+    }
+    let parts: Vec<_> = pieces.iter().map(|piece| piece.to_data()).collect();
+    let rows = parts.iter().map(ArrayData::len).sum();
+    let mut whole = MutableArrayData::new(parts.iter().collect(), false, rows);
+    for (place, part) in parts.iter().enumerate() {
+        whole.try_extend(place, 0, part.len())?;
+    }
+    Ok(make_array(whole.freeze()))
 }
 
 /// The schema as a capsule.

@@ -82,6 +82,11 @@ impl BulkOut {
         registers.control(ENDPOINT, 0, epctl::EPENA | epctl::CNAK);
     }
 
+    /// Whether packets for it can be in the FIFO: it is in use, or was when its transfer was armed.
+    pub const fn can_receive(&self) -> bool {
+        self.active || self.armed && !self.muted
+    }
+
     /// A packet is in the FIFO.
     pub fn take_packet(&mut self, registers: &Registers, len: usize) {
         match self.packets.get_mut(self.taken) {

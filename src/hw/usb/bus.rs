@@ -266,12 +266,12 @@ impl Core {
                     true
                 }
                 (pktsts::OUT_COMPLETE, 0) => control.packet_done(),
-                (pktsts::OUT_DATA, BULK_OUT) if len <= PACKET => {
+                (pktsts::OUT_DATA, BULK_OUT) if len <= PACKET && bulk_out.can_receive() => {
                     bulk_out.take_packet(registers, len);
                     bulk = 1 << BULK_OUT;
                     true
                 }
-                (pktsts::OUT_COMPLETE, BULK_OUT) => {
+                (pktsts::OUT_COMPLETE, BULK_OUT) if bulk_out.can_receive() => {
                     bulk_out.transfer_done();
                     true
                 }

@@ -1,9 +1,11 @@
 //! Actisense's binary logs (`.ebl`), and what its gateways send to a computer (NGT-1, NGX, W2K-1), saved as it came.
 //!
-//! A log has tags, `ESC SOH … ESC LF`, with times, directions and messages, and between them messages as a gateway sends them, `DLE STX … DLE ETX`, with a
-//! checksum. What a gateway sent, saved without a log, is such messages alone. As Actisense's SDK describes both (EBL 1.002, BST 93, 94, 95 and D0).
+//! A log has tags, `ESC SOH … ESC LF`, with times, directions and messages, and between them messages as a gateway sends
+//! them, `DLE STX … DLE ETX`, with a checksum. What a gateway sent, saved without a log, is such messages alone. Actisense's
+//! SDK describes both (EBL 1.002, BST 93, 94, 95 and D0).
 //!
-//! Message 95 is a frame. The others are whole messages of NMEA 2000: one is a frame if its group never has more than one, or if the message says so.
+//! Message 95 is a frame. The others are whole messages of NMEA 2000: one is a frame if its group never has more than one, or
+//! if the message says so.
 
 use std::collections::VecDeque;
 use std::io;
@@ -231,7 +233,8 @@ impl<'a> Bst<'a> {
                     let Some(id) = id else { return Content::LeftOut(nmea2000::OF_THE_GATEWAY) };
                     let control = self.byte(8);
                     let direction = if control & 8 == 0 { Direction::Rx } else { Direction::Tx };
-                    let is_frame = data.len() <= 8 && control & 3 == 0;
+                    let packets = control & 3;
+                    let is_frame = data.len() <= 8 && packets == 0;
                     let stamp = Stamp::milliseconds(self.u32(9), 32);
                     Content::of(is_frame, Frame { id, direction, stamp, data })
                 }
@@ -276,7 +279,8 @@ impl Stamp {
         Self { ticks, bits, tick_ns: NS_PER_MS }
     }
 
-    /// How long after another one, in nanoseconds. Messages that were sent may stand a little behind those that were received later.
+    /// How long after another one, in nanoseconds. Messages that were sent may stand a little behind those that were
+    /// received later.
     fn since(self, other: Self) -> Option<i64> {
         if (self.bits, self.tick_ns) != (other.bits, other.tick_ns) {
             return None;
@@ -288,7 +292,8 @@ impl Stamp {
     }
 }
 
-/// The time, from the tags and the stamps: a message behind a tag is of the tag's time, and the stamps say how much later those are that follow.
+/// The time, from the tags and the stamps: a message behind a tag is of the tag's time, and the stamps say how much later
+/// those are that follow.
 #[derive(Default)]
 struct Clock {
     /// The last tag's time, until a message had it.
@@ -299,7 +304,7 @@ struct Clock {
 
 impl Clock {
     fn time_ns(&mut self, stamp: Stamp) -> i64 {
-        let by_stamp = self.last.and_then(|(last_ns, last)| Some(last_ns + stamp.since(last)?));
+        let by_stamp = self.last.and_then(|(last_ns, last)| Some(last_ns.saturating_add(stamp.since(last)?)));
         let last_ns = self.last.map(|(last_ns, _)| last_ns);
         let first_ns = || i64::from(stamp.ticks) * stamp.tick_ns;
         let time_ns = self.tag_ns.take().or(by_stamp).or(last_ns).unwrap_or_else(first_ns);

@@ -235,7 +235,8 @@ impl Decoder {
         self.table.has_frame(&typed)
     }
 
-    /// Goes on from minute to minute where WiCAN's stamps begin again. What was sent and what was received may come in another order than it was.
+    /// Goes on from minute to minute where WiCAN's stamps begin again. What was sent and what was received may come in another
+    /// order than it was.
     fn enter(&mut self, mut around: Around) {
         const LATE_MS: i64 = 1000;
         if let Some((stamp, ms)) = around.wican_ms().filter(|(_, ms)| *ms < MINUTE_MS) {

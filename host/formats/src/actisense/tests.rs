@@ -124,6 +124,21 @@ fn what_a_gateway_sent_is_read_without_a_log_and_may_begin_inside_a_message() {
     assert_eq!(Format::of_content(&sent(&frame(1, 0x09F8_0100, &[]))), None);
 }
 
+/// The last time that there is, and stamps behind it.
+#[test]
+fn a_time_at_the_end_of_all_times_goes_no_further() {
+    let last = 116_444_736_000_000_000 + i64::MAX as u64 / 100;
+    let file = [
+        tag(3, &last.to_le_bytes()),
+        tag(7, &frame(1, 0x09F8_0100, &[1])),
+        tag(7, &frame(2, 0x09F8_0100, &[2])),
+        tag(3, &u64::MAX.to_le_bytes()),
+    ];
+    let (records, issues) = tests::read(Format::Actisense, file.concat());
+    assert_eq!(records.iter().map(|record| record.time_ns).max(), Some(i64::MAX));
+    assert_eq!((records.len(), issues.len()), (2, 1), "{issues:?}");
+}
+
 #[test]
 fn damage_costs_what_it_hit_and_a_cut_end_is_named() {
     let good = tag(7, &frame(1, 0x09F8_0100, &[1]));

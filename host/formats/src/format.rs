@@ -75,6 +75,8 @@ pub enum Format {
     Saleae,
     /// The log of CANServer, a logger for Teslas.
     CanServer,
+    /// The binary log of Actisense's gateways for NMEA 2000, or what such a gateway sent.
+    Actisense,
     /// The trace window of CANalyzer and CANoe, copied as text.
     TraceWindow,
     /// The log of ESPHome's component for CAN.

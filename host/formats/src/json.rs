@@ -19,6 +19,7 @@ use cantap_trace::{DeviceNs, Direction, TraceEvent, TraceFrame, TraceRecord};
 use object::{Field, Kind, Next};
 
 const NO_FRAMES: &str = "JSON objects that are no frames";
+const TOPICS: &str = "words before an object, such as its topic or a time, are left out";
 const EXPECTED: &str =
     "a JSON object with a frame, such as {\"timestamp\": 1.5, \"id\": \"123\", \"data\": \"DEADBEEF\"}";
 
@@ -32,6 +33,8 @@ pub(crate) struct Decoder {
     /// Whether an object was entered for the array in it.
     inside: bool,
     around: Around,
+    /// WiCAN's last stamp, and the whole minutes before it.
+    minute: Option<(i64, i64)>,
     notes: Vec<&'static str>,
     noted: Vec<&'static str>,
 }
@@ -53,6 +56,11 @@ struct Around {
 impl Around {
     /// Of the fields of an object of which so many bytes are left behind the beginning of its array.
     fn of(mut fields: Vec<Field>, rest: usize) -> Self {
+        if is_of_wican(&fields)
+            && let Some(stamp) = fields.iter_mut().find(|field| field.name == WICAN_STAMP)
+        {
+            WICAN_MS.clone_into(&mut stamp.name);
+        }
         for field in &mut fields {
             if field.name == "type" && matches!(field.value.as_str(), "rx" | "tx") {
                 "direction".clone_into(&mut field.name);
@@ -60,6 +68,13 @@ impl Around {
         }
         fields.retain(|field| table::role_of_many(&field.name).is_some());
         Self { fields, rest }
+    }
+
+    /// The stamp of WiCAN's message, in milliseconds.
+    fn wican_ms(&mut self) -> Option<(&mut Field, i64)> {
+        let stamp = self.fields.iter_mut().find(|field| field.name == WICAN_MS)?;
+        let ms = text::decimal(stamp.value.as_bytes()).and_then(|ms| i64::try_from(ms).ok())?;
+        Some((stamp, ms))
     }
 
     /// Adds to a frame's own fields what they do not say.
@@ -81,11 +96,29 @@ impl Around {
     }
 }
 
+/// WiCAN's stamp, and how it is called where it is known to be in milliseconds.
+const WICAN_STAMP: &str = "ts";
+const WICAN_MS: &str = "ts_ms";
+
+const MINUTE_MS: i64 = 60_000;
+
+/// Whether an object is a message of WiCAN's: `{"bus":"0","type":"rx","ts":34610,"frame":[…`.
+fn is_of_wican(fields: &[Field]) -> bool {
+    /// Eleven days; what is more counts since 1970, in whatever unit.
+    const MOST_MS: u64 = 1_000_000_000;
+    let value = |name: &str| fields.iter().find(|field| field.name == name).map(|field| field.value.as_str());
+    let stamp = value(WICAN_STAMP).and_then(|stamp| text::decimal(stamp.as_bytes()));
+    value("bus").is_some()
+        && matches!(value("type"), Some("rx" | "tx"))
+        && stamp.is_some_and(|ms| ms < MOST_MS)
+}
+
 /// Whether a text begins with such frames.
 pub(crate) fn is_head(head: &[u8]) -> bool {
     /// Enough for what a program says of itself before the frames.
     const OBJECTS: usize = 8;
-    if !matches!(head.trim_ascii_start().first(), Some(b'{' | b'[' | 0x1E)) {
+    let start = head.trim_ascii_start();
+    if !matches!(start.first(), Some(b'{' | b'[' | 0x1E)) && !object::begins_behind_topic(start) {
         return false;
     }
     let decoder = Decoder::default();
@@ -189,10 +222,36 @@ impl Decoder {
         Self { table: table::Decoder::new(columns), ..Self::default() }
     }
 
+    fn say(&mut self, note: &'static str) {
+        if !self.noted.contains(&note) {
+            self.noted.push(note);
+            self.notes.push(note);
+        }
+    }
+
     fn is_frame(&self, fields: &[Field]) -> bool {
         let typed: Vec<_> =
             fields.iter().map(|field| TypedColumn { name: &field.name, form: TypedForm::Text }).collect();
         self.table.has_frame(&typed)
+    }
+
+    /// Goes on from minute to minute where WiCAN's stamps begin again. What was sent and what was received may come in another
+    /// order than it was.
+    fn enter(&mut self, mut around: Around) {
+        const LATE_MS: i64 = 1000;
+        if let Some((stamp, ms)) = around.wican_ms().filter(|(_, ms)| *ms < MINUTE_MS) {
+            let (last_ms, whole_ms) = self.minute.unwrap_or((ms, 0));
+            let whole_ms = if ms < last_ms - LATE_MS {
+                whole_ms + MINUTE_MS
+            } else if ms > last_ms + MINUTE_MS - LATE_MS && whole_ms > 0 {
+                whole_ms - MINUTE_MS
+            } else {
+                whole_ms
+            };
+            self.minute = Some((ms, whole_ms));
+            stamp.value = (whole_ms + ms).to_string();
+        }
+        self.around = around;
     }
 
     /// Takes names that came for the first time into the columns.
@@ -317,6 +376,7 @@ impl Decode for Decoder {
                 }
             }
             let text = input.buffered();
+            let was_inside = self.inside;
             let (skipped, used, found) = match object::next(text, self.inside) {
                 Next::Object { start, end, inner } => {
                     let fields = object::fields(&text[start..end]);
@@ -327,7 +387,7 @@ impl Decode for Decoder {
                             self.inside |= enters.is_some();
                             let used = enters.unwrap_or(end);
                             let line = if let Some(inner) = enters {
-                                self.around = Around::of(fields, end - inner);
+                                self.enter(Around::of(fields, end - inner));
                                 Ok(Line::Nothing)
                             } else {
                                 self.around.pass(start);
@@ -373,13 +433,16 @@ impl Decode for Decoder {
                 }
             };
             let line = input.line_number() + 1 + lines_in(&text[..skipped]);
+            if !was_inside
+                && matches!(found, Some(Ok(_)))
+                && text[..skipped].iter().any(u8::is_ascii_alphanumeric)
+            {
+                self.say(TOPICS);
+            }
             let lines = lines_in(&text[..used]);
             input.consume_lines(used, lines);
             while let Some(note) = self.table.note() {
-                if !self.noted.contains(&note) {
-                    self.noted.push(note);
-                    self.notes.push(note);
-                }
+                self.say(note);
             }
             match found {
                 None | Some(Ok(Line::Nothing | Line::Two(..))) => {}

@@ -10,6 +10,7 @@
 #[cfg(test)]
 extern crate self as cantap_formats;
 
+mod actisense;
 mod analyser;
 mod archive;
 mod asc;

@@ -14,6 +14,8 @@
 mod message;
 mod sentence;
 
+use std::collections::VecDeque;
+
 use super::calendar::NS_PER_DAY;
 use super::frame_fields::{FrameFields, Payload, hex_byte, identifier};
 use super::issue::Fault;
@@ -22,16 +24,18 @@ use super::table::date;
 use super::text::{self, NS_PER_S};
 use super::zone::Zone;
 use cantap_trace::{Direction, TraceRecord};
-use message::{Form, Message, Time, id};
+pub(crate) use message::id;
+use message::{Form, Message, Time};
 use sentence::{Habits, Sentence};
 
 const EXPECTED: &str = "a line of an NMEA 2000 gateway such as '00:29:58.617 R 0DFF180D A2 8C', \
                         '2011-11-24-22:42:04.388,2,127250,36,255,2,ff,10', 'A000159.990 CCFF7 0FF63 3B9F' or \
                         '$PCDIN,01F119,00000000,0F,2AAF00D1067414FF*59'";
-const PUT_TOGETHER: &str = "NMEA 2000 messages that their gateway put together from several frames";
+pub(crate) const PUT_TOGETHER: &str =
+    "NMEA 2000 messages that their gateway put together from several frames";
 const OF_ANOTHER_SOURCE: &str = "lines of Signal K's log that are of no NMEA 2000 gateway";
-const OF_THE_GATEWAY: &str = "messages of the gateway itself";
-const OTHER_SENTENCES: &str = "NMEA 0183 sentences that carry no NMEA 2000";
+pub(crate) const OF_THE_GATEWAY: &str = "messages of the gateway itself";
+pub(crate) const OTHER_SENTENCES: &str = "NMEA 0183 sentences that carry no NMEA 2000";
 const TO_GATEWAY: &str = "sentences to a gateway, which sends them with an address of its own";
 const SENTENCE: &str = "a whole NMEA 0183 sentence with a right checksum";
 const NO_TIMES: &str =
@@ -67,6 +71,8 @@ pub(crate) struct Decoder {
     /// The last stamp of `$PCDIN`, and what was lost to 32 bits before it.
     stamp_ns: i64,
     wrapped_ns: i64,
+    /// The other sentences of the last line.
+    rest: VecDeque<Vec<u8>>,
     notes: Notes,
 }
 
@@ -94,9 +100,11 @@ pub(crate) fn is_line(line: &[u8]) -> bool {
 /// Whether NMEA 0183 sentences of a text carry NMEA 2000.
 pub(crate) fn has_sentence(text: &[u8]) -> bool {
     let begins = |line: &[u8]| matches!(line.first(), Some(b'$' | b'!' | b'\\' | b'0'..=b'9' | b'['));
-    let mut lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty());
+    let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).filter(|line| !line.is_empty());
     lines.clone().find(|line| !line.starts_with(b"#")).is_some_and(begins)
-        && lines.any(|line| sentence::Line::of(line).is_some_and(|line| line.is_of_nmea2000()))
+        && lines
+            .flat_map(sentence::each)
+            .any(|line| sentence::Line::of(&line).is_some_and(|line| line.is_of_nmea2000()))
 }
 
 /// Whether a text is a log of Signal K with such a line.
@@ -221,7 +229,7 @@ fn of_day_ns(hours: &[u8], minutes: &[u8], seconds: &[u8]) -> Option<i64> {
 }
 
 /// Whether the messages of a group are one frame each, so that nothing was put together.
-fn is_single(id: u32) -> bool {
+pub(crate) fn is_single(id: u32) -> bool {
     let group = id >> 8 & 0x3_FFFF;
     // Up to there are the groups of J1939, which need a transport protocol for more than 8 bytes.
     !(0x1_ED00..0x2_0000).contains(&group)
@@ -321,7 +329,9 @@ impl RowFormat for Decoder {
         };
         self.puts_together = lines().filter_map(message).any(|message| message.len > 8);
         let sample = &buffered[..buffered.len().min(SAMPLE_BYTES)];
-        self.habits = Habits::of(sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii));
+        let sentences: Vec<_> =
+            sample.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii).flat_map(sentence::each).collect();
+        self.habits = Habits::of(sentences.iter().map(Vec::as_slice));
         if self.habits.order_unknown {
             self.notes.say(ORDER_UNKNOWN);
         }
@@ -331,6 +341,37 @@ impl RowFormat for Decoder {
         if line.is_empty() || line.starts_with(b"#") {
             return Ok(Line::Nothing);
         }
+        if sentence::has_more(line) {
+            self.rest.extend(sentence::each(line));
+            return Ok(Line::Nothing);
+        }
+        self.one(line, zone)
+    }
+
+    fn more(&mut self, zone: &Zone) -> Option<Result<Line, Fault>> {
+        let line = self.rest.pop_front()?;
+        if sentence::Line::of(&line).is_none_or(|line| line.is_cut()) {
+            return Some(Err(Fault::malformed(SENTENCE, &line)));
+        }
+        Some(self.one(&line, zone))
+    }
+
+    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        // The form with commas says how many bytes there are, and no frame has more than 8; a sentence has a checksum.
+        if sentence::Line::of(line).is_some() {
+            return !line.contains(&b'*');
+        }
+        !line.contains(&b',') && record.frame().is_none_or(|frame| frame.data().len() < 8)
+    }
+
+    fn note(&mut self) -> Option<&'static str> {
+        self.notes.next.pop()
+    }
+}
+
+impl Decoder {
+    /// What a line with one message says.
+    fn one(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
         let (logged_ns, message) = match self.content(line, zone)? {
             Content::Message(logged_ns, message) => (logged_ns, message),
             Content::LeftOut(what) => return Ok(Line::LeftOut(what)),
@@ -362,18 +403,6 @@ impl RowFormat for Decoder {
             channel: 1,
             event: fields.event(&message.data)?,
         }))
-    }
-
-    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
-        // The form with commas says how many bytes there are, and no frame has more than 8; a sentence has a checksum.
-        if sentence::Line::of(line).is_some() {
-            return !line.contains(&b'*');
-        }
-        !line.contains(&b',') && record.frame().is_none_or(|frame| frame.data().len() < 8)
-    }
-
-    fn note(&mut self) -> Option<&'static str> {
-        self.notes.next.pop()
     }
 }
 

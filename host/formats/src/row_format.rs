@@ -32,6 +32,11 @@ pub(crate) trait RowFormat: Send {
     /// otherwise.
     fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault>;
 
+    /// What else stood on the last line, where one has more than one of what others have one of.
+    fn more(&mut self, _zone: &Zone) -> Option<Result<Line, Fault>> {
+        None
+    }
+
     /// Whether a last line that reads well but has no line end may have lost its end.
     fn may_be_cut(&self, _line: &[u8], _record: &TraceRecord) -> bool {
         true
@@ -69,6 +74,14 @@ impl<F> Rows<F> {
     }
 }
 
+impl<F> Rows<F> {
+    /// The first of two events; the other one is next.
+    fn two(&mut self, record: TraceRecord, second: TraceEvent) -> Found {
+        self.more.keep([TraceRecord { event: second, ..record }]);
+        Found::Record(record)
+    }
+}
+
 impl<F: RowFormat> Decode for Rows<F> {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(found) = self.more.next() {
@@ -81,7 +94,17 @@ impl<F: RowFormat> Decode for Rows<F> {
             self.format.begin(input.buffered());
         }
         let zone = input.zone().clone();
-        while let Some(line) = input.line()? {
+        loop {
+            if let Some(more) = self.format.more(&zone) {
+                match more {
+                    Ok(Line::Nothing) => continue,
+                    Ok(Line::Record(record)) => return Ok(Found::Record(record)),
+                    Ok(Line::Two(record, second)) => return Ok(self.two(record, second)),
+                    Ok(Line::LeftOut(what)) => return Ok(Found::LeftOut(what)),
+                    Err(fault) => return Ok(Found::Issue(Place::Line(input.line_number()), fault)),
+                }
+            }
+            let Some(line) = input.line()? else { break };
             let end = line.text.trim_ascii_end();
             let text = if self.format.trims() { end.trim_ascii_start() } else { end };
             match self.format.line(text, &zone) {
@@ -91,10 +114,7 @@ impl<F: RowFormat> Decode for Rows<F> {
                 }
                 Ok(Line::Record(record)) => return Ok(Found::Record(record)),
                 Ok(Line::Two(..) | Line::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
-                Ok(Line::Two(record, second)) => {
-                    self.more.keep([TraceRecord { event: second, ..record }]);
-                    return Ok(Found::Record(record));
-                }
+                Ok(Line::Two(record, second)) => return Ok(self.two(record, second)),
                 Ok(Line::LeftOut(what)) => return Ok(Found::LeftOut(what)),
                 Err(fault) => return Ok(line.issue(fault)),
             }

@@ -18,9 +18,9 @@ use super::row_format::Rows;
 use super::trc::TrcVersion;
 use super::writer::WriteOptions;
 use super::{
-    asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking, canserver,
-    carbus, crtd, csv, esphome, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap, pcapng,
-    printer, rlog, saleae, sigrok, slcan, table, trace_window, trc, usbcan,
+    actisense, asc, battery_emulator, blf, busmaster, candump, candump_screen, canedge, canhacker, canking,
+    canserver, carbus, crtd, csv, esphome, gvret, json, kvaser, labelled, mf4, microchip, nmea2000, pcap,
+    pcapng, printer, rlog, saleae, sigrok, slcan, table, trace_window, trc, usbcan,
 };
 
 /// One format.
@@ -511,6 +511,15 @@ const FORMATS: &[FormatSpec] = &[
         begins: |head| canserver::is_head(head.bytes),
         has_head: true,
         reader: |_| Box::new(canserver::Decoder::default()),
+        writer: None,
+    },
+    FormatSpec {
+        format: Format::Actisense,
+        names: &["actisense", "ebl"],
+        suffixes: &["ebl"],
+        begins: |head| actisense::is_head(head.bytes),
+        has_head: true,
+        reader: |_| Box::new(actisense::Decoder::default()),
         writer: None,
     },
 ];

@@ -36,12 +36,31 @@ pub(super) fn next(text: &[u8], inside: bool) -> Next {
             },
             _ if inside => at += 1,
             _ => {
+                if let Some(topic) = behind_topic(&text[at..]) {
+                    return object(text, at + topic);
+                }
                 let end = memchr::memchr(b'\n', &text[at..]);
                 return end.map_or(Next::More { start: at }, |end| Next::Other { start: at, end: at + end });
             }
         }
     }
     Next::End
+}
+
+/// Whether an object begins behind other words on the first line.
+pub(super) fn begins_behind_topic(text: &[u8]) -> bool {
+    behind_topic(text).is_some()
+}
+
+/// Where an object begins behind other words on its line: a topic, as `mosquitto_sub -v` prints it, or a time.
+fn behind_topic(text: &[u8]) -> Option<usize> {
+    /// Longer than any topic with a time.
+    const MOST_BYTES: usize = 300;
+    let line = text[..text.len().min(MOST_BYTES)].split(|byte| *byte == b'\n').next()?;
+    let brace = memchr::memchr(b'{', line)?;
+    let (before, rest) = line.split_at(brace);
+    let is_object = rest[1..].trim_ascii_start().first().is_none_or(|first| matches!(first, b'"' | b'}'));
+    (before.ends_with(b" ") && memchr::memchr2(b'"', b'}', before).is_none() && is_object).then_some(brace)
 }
 
 enum StringEnd {

@@ -54,8 +54,19 @@ fn objects_of_different_programs_are_read_whole() {
             "{\"bus\":\"0\",\"type\":\"rx\",\"ts\":34610,\"frame\":[{\"id\":123,\"dlc\":2,\"rtr\":false,\"extd\":true,\"data\":[7,8]},\
              {\"id\":124,\"dlc\":1,\"rtr\":false,\"extd\":false,\"data\":[9]}]}\n\
              {\"bus\":\"0\",\"type\":\"tx\",\"ts\":34710,\"frame\":[{\"id\":124,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
-             {\"ts\":34810,\"id\":124,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}\n",
+             {\"ts_ms\":34810,\"id\":124,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}\n",
             "(34.610000) can0 0000007B#0708\n(34.610000) can0 07C#09\n(34.710000) can0 07C# T\n(34.810000) can0 07C#\n",
+        ),
+        // Its stamps are milliseconds of a minute, and begin again; a message may come a little late.
+        (
+            "{\"bus\":\"0\",\"type\":\"rx\",\"ts\":59990,\"frame\":[{\"id\":1,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"bus\":\"0\",\"type\":\"rx\",\"ts\":10,\"frame\":[{\"id\":2,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"bus\":\"0\",\"type\":\"tx\",\"ts\":59995,\"frame\":[{\"id\":3,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"bus\":\"0\",\"type\":\"rx\",\"ts\":25000,\"frame\":[{\"id\":4,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"bus\":\"0\",\"type\":\"rx\",\"ts\":50000,\"frame\":[{\"id\":5,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+             {\"bus\":\"0\",\"type\":\"rx\",\"ts\":7,\"frame\":[{\"id\":6,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n",
+            "(59.990000) can0 001#\n(60.010000) can0 002#\n(59.995000) can0 003# T\n(85.000000) can0 004#\n(110.000000) can0 005#\n\
+             (120.007000) can0 006#\n",
         ),
         // `tshark -T ek`: a line about the index before each frame, the time twice, decimal identifiers in texts.
         (
@@ -101,6 +112,29 @@ fn what_is_no_frame_is_counted_and_what_is_broken_is_named_with_its_line() {
     assert_eq!(issues.len(), 4, "{issues:#?}");
     assert_eq!(lines, ["line 3", "line 4", "line 6", "line 9"], "{issues:#?}");
     assert_eq!(counts(file).0, [(super::NO_FRAMES.to_owned(), 1)]);
+}
+
+/// As `mosquitto_sub -v` prints messages, with a topic that may have blanks, and with a time if it was asked for.
+#[test]
+fn objects_behind_a_topic_are_read_and_the_topic_is_reported() {
+    let file = "cars/a b/rx {\"ts\": 1.5, \"id\": \"0x123\", \"data\": \"11\"}\n\
+                2023-11-14T22:13:20+0100 cars/rx {\"ts\": 1.6, \"id\": \"0x123\", \"data\": \"12\"}\n\
+                cars/status online {yes}\n{\"ts\": 1.7, \"id\": \"0x123\", \"data\": \"13\"}\n\
+                cars/rx {\n  \"ts\": 1.8, \"id\": \"0x123\", \"data\": \"14\"\n}\n";
+    assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Json));
+    let (log, issues) = as_log(file);
+    assert_eq!(
+        log,
+        "(1.500000) can0 123#11\n(1.600000) can0 123#12\n(1.700000) can0 123#13\n(1.800000) can0 123#14\n"
+    );
+    assert_eq!(issues.len(), 1, "{issues:?}");
+    assert!(issues[0].contains("line 3"), "{issues:?}");
+    assert!(counts(file).1.contains(&super::TOPICS.to_owned()), "{:?}", counts(file));
+    let file = "wican/1/rx {\"bus\":\"0\",\"type\":\"rx\",\"ts\":7,\"frame\":[{\"id\":1,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n\
+                wican/1/rx {\"bus\":\"0\",\"type\":\"rx\",\"ts\":9,\"frame\":[{\"id\":2,\"dlc\":0,\"rtr\":false,\"extd\":false,\"data\":[]}]}\n";
+    assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Json));
+    assert_eq!(as_log(file), ("(0.007000) can0 001#\n(0.009000) can0 002#\n".to_owned(), vec![]));
+    assert!(counts(file).1.contains(&super::TOPICS.to_owned()), "{:?}", counts(file));
 }
 
 /// A key that only some objects have is no less one of a frame.

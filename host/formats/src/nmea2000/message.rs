@@ -45,7 +45,7 @@ pub(super) const fn is_addressed(group: u32) -> bool {
 }
 
 /// The identifier of a message's frames.
-pub(super) fn id(priority: u32, group: u32, source: u32, destination: u32) -> Option<u32> {
+pub(crate) fn id(priority: u32, group: u32, source: u32, destination: u32) -> Option<u32> {
     let is_of_bus = priority <= 7 && group <= 0x3_FFFF && !(is_addressed(group) && group & 0xFF != 0);
     let low = if is_addressed(group) { destination << 8 } else { 0 };
     is_of_bus.then_some(priority << 26 | group << 8 | low | source)

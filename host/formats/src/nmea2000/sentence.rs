@@ -69,24 +69,47 @@ impl Ticks {
     }
 }
 
+/// The sentences of a line, each behind what stands before the first: some gateways end no line between them.
+pub(super) fn each(line: &[u8]) -> Vec<Vec<u8>> {
+    let starts: Vec<_> =
+        memchr::memchr2_iter(b'$', b'!', line).filter(|at| Line::begins(&line[*at..])).collect();
+    let before = &line[..starts.first().copied().unwrap_or(0)];
+    let ends = starts.iter().copied().skip(1).chain([line.len()]);
+    let parts =
+        starts.iter().zip(ends).map(|(start, end)| [before, line[*start..end].trim_ascii_end()].concat());
+    parts.collect()
+}
+
+/// Whether a line has more than one sentence.
+pub(super) fn has_more(line: &[u8]) -> bool {
+    memchr::memchr2_iter(b'$', b'!', line).filter(|at| Line::begins(&line[*at..])).nth(1).is_some()
+}
+
 /// A line's sentence, without its checksum, and what stands before it.
 pub(super) struct Line<'a> {
     before: &'a [u8],
     body: &'a [u8],
     is_whole: bool,
+    has_sum: bool,
 }
 
 impl<'a> Line<'a> {
+    /// Whether a sentence begins there.
+    fn begins(text: &[u8]) -> bool {
+        let name = text[1..].split(|byte| *byte == b',').next().unwrap_or_default();
+        (4..=6).contains(&name.len())
+            && name.iter().all(|byte| byte.is_ascii_uppercase() || byte.is_ascii_digit())
+            && text.len() > 1 + name.len()
+    }
+
+    /// Whether its checksum is missing, which only Digital Yacht leaves out.
+    pub fn is_cut(&self) -> bool {
+        !self.has_sum && self.name() != b"PDGY"
+    }
+
     /// `None` if there is no sentence in it.
     pub fn of(line: &'a [u8]) -> Option<Self> {
-        let starts = memchr::memchr2_iter(b'$', b'!', line);
-        let is_sentence = |at: &usize| {
-            let name = line[at + 1..].split(|byte| *byte == b',').next().unwrap_or_default();
-            (4..=6).contains(&name.len())
-                && name.iter().all(|byte| byte.is_ascii_uppercase() || byte.is_ascii_digit())
-                && line.len() > at + 1 + name.len()
-        };
-        let start = starts.into_iter().find(is_sentence)?;
+        let start = memchr::memchr2_iter(b'$', b'!', line).find(|at| Self::begins(&line[*at..]))?;
         let (before, sentence) = line.split_at(start);
         let sentence = &sentence[1..];
         let (body, sum) = match memchr::memrchr(b'*', sentence) {
@@ -95,7 +118,7 @@ impl<'a> Line<'a> {
         };
         let is = body.iter().fold(0, |sum, byte| sum ^ byte);
         let is_whole = sum.is_none_or(|sum| hex_byte(sum) == Some(is));
-        Some(Self { before, body, is_whole })
+        Some(Self { before, body, is_whole, has_sum: sum.is_some() })
     }
 
     /// Whether it carries NMEA 2000.

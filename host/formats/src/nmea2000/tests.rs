@@ -167,6 +167,25 @@ fn sentences_of_seasmart_are_read_with_stamps_of_each_kind() {
     );
 }
 
+/// As SeaSmart's and other boards' programs send them on.
+#[test]
+fn several_sentences_on_a_line_are_read_each() {
+    let file = "$PCDIN,01F119,00000400,0F,2AAF00D1067414FF*5D$PCDIN,01F119,00000404,0F,2AAF00D1067414FE*5A $GPDPT,2.4,-0.0*7C\r\n\
+                1700000000.5 $PCDIN,01F119,00000408,0F,2AAF00D1067414FF*55$PCDIN,01F119,000\
+                $PCDIN,01F119,00000408,0F,2AAF00D1067414FE*56$PCDIN,01F119,00000408,0F,2AAF00D1067414FD*57\r\n\
+                $GPDPT,2.4,-0.0*7C$PCDIN,01F119,00000410,0F,2AAF00D1067414FF*5C$PCDIN,01F119,00000410,0F,2AAF";
+    assert_eq!(Format::of_content(file.as_bytes()), Some(Format::Nmea2000));
+    let (log, issues) = as_log(file);
+    assert_eq!(
+        log,
+        "(1.024000) can0 19F1190F#2AAF00D1067414FF\n(1.028000) can0 19F1190F#2AAF00D1067414FE\n\
+         (1700000000.500000) can0 19F1190F#2AAF00D1067414FF\n(1700000000.500000) can0 19F1190F#2AAF00D1067414FE\n\
+         (1700000000.500000) can0 19F1190F#2AAF00D1067414FD\n(1.040000) can0 19F1190F#2AAF00D1067414FF\n"
+    );
+    assert_eq!(issues.len(), 2, "{issues:?}");
+    assert!(issues[0].contains("line 2") && issues[1].contains("line 3"), "{issues:?}");
+}
+
 #[test]
 fn times_before_a_sentence_count_and_digital_yachts_are_read() {
     for before in [

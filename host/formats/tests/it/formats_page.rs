@@ -69,6 +69,7 @@ fn row(format: Format) -> String {
             Format::Nmea2000 => ["as written, local if a date", "– | from Yacht Devices | – | – | – | – | –"],
             Format::Saleae => ["as written, local if a date", "yes | – | yes | – | – | – | –"],
             Format::CanServer => ["1 ms, or 1 µs", "yes | – | – | – | – | – | –"],
+            Format::Actisense => ["1 ms", "– | yes | – | – | – | – | –"],
             Format::Carbus => ["as written, no date", "yes | – | – | – | – | – | –"],
             Format::UsbCan => ["as written, local if a date", "yes | yes | yes | yes | – | – | –"],
             Format::Labelled => ["as printed, local if a clock", "– | yes | yes | without flags | – | – | –"],

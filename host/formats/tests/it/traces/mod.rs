@@ -59,6 +59,7 @@ pub fn file_name(format: Format, compression: &str) -> String {
         Format::Mcap => "mcap",
         Format::RosBag => "bag",
         Format::CanServer => "cslog",
+        Format::Actisense => "ebl",
         Format::Crtd => "crtd",
         Format::Microchip => "can",
         new => panic!("{new} has no suffix here yet"),

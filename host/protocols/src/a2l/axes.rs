@@ -5,14 +5,12 @@ use std::sync::Arc;
 use a2lfile::{A2lObjectName as _, AxisDescr, AxisDescrAttribute, AxisPts, DepositMode};
 
 use super::conversion::{Conversion, Meaning, Texts};
-use super::load::shown;
+use super::data_type::DataType;
 use super::module::Loader;
-use super::object::{Axis, DataType, MemoryObject, PartOfRecord, Shape};
-use super::record::{Record, Role};
+use super::object::{Axis, MemoryObject, PartOfRecord, Shape};
+use super::record::{LETTERS, Record, Role};
+use super::shown::shown;
 use crate::Field;
-
-/// The letters of axes.
-pub(super) const LETTERS: [&str; 5] = ["X", "Y", "Z", "4", "5"];
 
 /// The name of what says how many points an axis has.
 fn number_name(of: &str, axis: usize) -> String {

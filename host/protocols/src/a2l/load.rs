@@ -1,18 +1,15 @@
 //! Reads A2L files with the crate a2lfile.
 
 use a2lfile::A2lFile;
-use cantap_trace::clean;
 use encoding_rs::{UTF_16BE, UTF_16LE, WINDOWS_1252};
 
 use super::description::Description;
 use super::module::Loader;
 use super::nesting::{TooDeep, bounded};
+use super::shown::{MOST_ISSUES, shown};
 
 /// The largest file that is read, with what it includes, in bytes.
 const MOST_BYTES: usize = 512 << 20;
-/// How many things that are left out are listed by name.
-pub(super) const MOST_ISSUES: usize = 1000;
-
 /// How deep files may include each other.
 const DEEPEST: usize = 8;
 /// How many files may be included altogether: those that include each other twice would never end.
@@ -86,11 +83,6 @@ impl Description {
         }
         Err(A2lError::Malformed(shown(&error.to_string())))
     }
-}
-
-/// A text of the file, as it can be shown.
-pub(super) fn shown(text: &str) -> String {
-    clean::line(text).into_owned()
 }
 
 /// The text of a file, in whichever of the usual encodings.

@@ -6,6 +6,7 @@
 
 mod axes;
 mod conversion;
+mod data_type;
 mod description;
 mod if_data;
 mod load;
@@ -15,15 +16,17 @@ mod module;
 mod nesting;
 mod object;
 mod record;
+mod shown;
 mod structures;
 #[cfg(test)]
 mod tests;
 
 pub use conversion::{Conversion, Meaning, Texts};
+pub use data_type::{DataType, Dimension};
 pub use description::{A2lDescriptions, Description};
 pub use if_data::{DaqEvent, EcuConnection};
 pub use load::{A2lError, Include};
-pub use object::{Axis, Bits, DataType, Dimension, MemoryObject, PartOfRecord, Shape, ValueError};
+pub use object::{Axis, Bits, MemoryObject, PartOfRecord, Shape, ValueError};
 
 use crate::Field;
 use crate::calibration::lists::ListEntry;

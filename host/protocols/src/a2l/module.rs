@@ -8,13 +8,13 @@ use a2lfile::{
 };
 use cantap_trace::formula::{Dialect, Formula};
 
-use super::axes::LETTERS;
 use super::conversion::{Conversion, Texts};
+use super::data_type::{DataType, type_of};
 use super::description::Description;
 use super::if_data::EcuConnection;
-use super::load::{MOST_ISSUES, shown};
-use super::object::{Bits, DataType, MemoryObject, PartOfRecord, Shape};
-use super::record::{Record, Role, in_rows};
+use super::object::{Bits, MemoryObject, PartOfRecord, Shape};
+use super::record::{LETTERS, Record, Role, in_rows, product};
+use super::shown::{MOST_ISSUES, shown};
 use super::structures;
 use crate::calibration::parts::ByteOrder;
 
@@ -45,29 +45,6 @@ enum Order {
     /// Of words otherwise than of their bytes.
     Mixed,
     Known(ByteOrder),
-}
-
-pub(super) const fn type_of(data_type: a2lfile::DataType) -> DataType {
-    use a2lfile::DataType as Type;
-    match data_type {
-        Type::Ubyte => DataType::Unsigned(1),
-        Type::Sbyte => DataType::Signed(1),
-        Type::Uword => DataType::Unsigned(2),
-        Type::Sword => DataType::Signed(2),
-        Type::Ulong => DataType::Unsigned(4),
-        Type::Slong => DataType::Signed(4),
-        Type::AUint64 => DataType::Unsigned(8),
-        Type::AInt64 => DataType::Signed(8),
-        Type::Float16Ieee => DataType::Float(2),
-        Type::Float32Ieee => DataType::Float(4),
-        Type::Float64Ieee => DataType::Float(8),
-    }
-}
-
-/// The product of an array's dimensions.
-pub(super) fn product(dimensions: Option<&a2lfile::MatrixDim>) -> Option<u32> {
-    let dimensions = dimensions?.dim_list.iter().map(|one| u32::from((*one).max(1)));
-    dimensions.into_iter().try_fold(1_u32, u32::checked_mul)
 }
 
 /// The dimensions of an array without those of one at the end.

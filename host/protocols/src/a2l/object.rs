@@ -5,29 +5,10 @@ use std::sync::Arc;
 use half::f16;
 
 use super::conversion::{Conversion, Meaning, Texts};
+use super::data_type::{DataType, Dimension};
 use super::record::{Record, Role};
 use crate::calibration::parts::ByteOrder;
 use crate::{Field, Value};
-
-/// How a number is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DataType {
-    /// Without a sign, of 1, 2, 4 or 8 bytes.
-    Unsigned(u8),
-    /// In two's complement, of 1, 2, 4 or 8 bytes.
-    Signed(u8),
-    /// IEEE 754, of 2, 4 or 8 bytes.
-    Float(u8),
-}
-
-impl DataType {
-    /// Bytes of a number.
-    pub const fn size(self) -> usize {
-        match self {
-            Self::Unsigned(size) | Self::Signed(size) | Self::Float(size) => size as usize,
-        }
-    }
-}
 
 /// Which bits of a number are meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,17 +19,6 @@ pub struct Bits {
     pub shift: i32,
     /// The highest bit of the mask is a sign.
     pub is_signed: bool,
-}
-
-/// How many values there are in one direction, and how they follow each other.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Dimension {
-    /// How many.
-    pub count: u32,
-    /// Bytes from one to the next.
-    pub stride: u32,
-    /// The first index is the last in the memory.
-    pub is_reversed: bool,
 }
 
 /// How many values an object has.

@@ -2,11 +2,10 @@
 
 use a2lfile::{AddrType, DataTypeSize, IndexMode, IndexOrder, ModCommon, RecordLayout};
 
-use super::module::type_of;
-use super::object::{DataType, Dimension};
+use super::data_type::{DataType, Dimension, type_of};
 
-/// The most axes of a parameter.
-const MOST_AXES: usize = 5;
+/// The letters of a parameter's axes.
+pub const LETTERS: [&str; 5] = ["X", "Y", "Z", "4", "5"];
 
 /// A part of a record.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,7 +63,7 @@ pub struct Record {
     /// And each of their elements is where it is then.
     has_static_elements: bool,
     /// The number of points that the layout itself names, by axis.
-    fixed: [Option<u32>; MOST_AXES],
+    fixed: [Option<u32>; LETTERS.len()],
     /// Where parts are that are not understood.
     unclear: Option<&'static str>,
 }
@@ -80,6 +79,12 @@ const fn alignment_of(data_type: DataType) -> usize {
         DataType::Float(4) => 5,
         DataType::Float(_) => 6,
     }
+}
+
+/// The product of an array's dimensions.
+pub fn product(dimensions: Option<&a2lfile::MatrixDim>) -> Option<u32> {
+    let dimensions = dimensions?.dim_list.iter().map(|one| u32::from((*one).max(1)));
+    dimensions.into_iter().try_fold(1_u32, u32::checked_mul)
 }
 
 /// How numbers in so many dimensions follow each other without gaps, the first dimension in a row.

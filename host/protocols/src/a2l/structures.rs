@@ -1,13 +1,15 @@
-//! Instances of types (INSTANCE, version 1.7): each member of a structure becomes a measurement, a parameter or an axis of its own, named by
-//! its path, as `Engine.Cylinder[2].Pressure`.
+//! Instances of types (INSTANCE, version 1.7).
+//!
+//! Each member of a structure becomes a measurement, a parameter or an axis of its own, named by its path, as `Engine.Cylinder[2].Pressure`.
 
 use a2lfile::{
     A2lObjectName as _, AddrType, AxisPts, Characteristic, CharacteristicType, Conversion, EcuAddress,
     IndexMode, Instance, MatrixDim, Measurement, Module, Overwrite,
 };
 
-use super::module::product;
-use super::record::in_rows;
+use super::data_type::type_of;
+use super::record::{in_rows, product};
+use super::shown::MOST_ISSUES;
 
 /// The most members of all structures of a file, those that are structures themselves among them.
 const MOST_MEMBERS: usize = 1 << 18;
@@ -74,7 +76,7 @@ impl<'m> Walk<'m> {
     fn take(&mut self, type_name: &str, spot: Spot<'m>) {
         self.seen += 1;
         if spot.depth > DEEPEST || self.seen > MOST_MEMBERS {
-            if self.members.issues.len() < super::load::MOST_ISSUES {
+            if self.members.issues.len() < MOST_ISSUES {
                 self.issue(&spot.path, "there are too many structures, or too deep in each other");
             }
             return;
@@ -106,7 +108,7 @@ impl<'m> Walk<'m> {
                 }
             }
         } else if let Some(one) = module.typedef_measurement.get(type_name) {
-            let size = super::module::type_of(one.datatype).size() as u32;
+            let size = type_of(one.datatype).size() as u32;
             let is_array = one.matrix_dim.is_some();
             let own = product(one.matrix_dim.as_ref()).unwrap_or(1);
             let spots = if is_array { self.elements(spot, size.saturating_mul(own)) } else { vec![spot] };

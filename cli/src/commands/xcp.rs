@@ -161,7 +161,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let options = args.options(description.as_deref())?;
     // Nothing is sent unless all of it can be.
-    let targets = args.targets(description.as_deref())?;
+    let mut targets = args.targets(description.as_deref())?;
     args.check(&targets)?;
     let device = args.speak.open()?;
     // What is read is described whatever identifiers the file has.
@@ -172,7 +172,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         Spoken::Ccp => Box::new(Ccp::new(known(Vec::new(), vec![options.parties]))),
     };
     let mut master = Master::new(args.speak.speak(&device, witness), options);
-    let done = args.perform(&targets, description.as_deref(), &mut master);
+    let done = args.perform(&mut targets, description.as_deref(), &mut master);
     master.disconnect();
     drop(master);
     device.stop()?;
@@ -249,7 +249,7 @@ impl Args {
 
     fn perform(
         &self,
-        targets: &[Target],
+        targets: &mut [Target],
         description: Option<&Description>,
         master: &mut Master<'_>,
     ) -> anyhow::Result<()> {
@@ -264,6 +264,9 @@ impl Args {
             master.show(|event| event.kind != EventKind::Periodic)?;
             return Err(error);
         }
+        for target in &mut *targets {
+            target.settle(description, master)?;
+        }
         match &self.what {
             What::Info => {
                 let inquired = master.inquire();
@@ -274,15 +277,24 @@ impl Args {
                 let mut rows = Rows::one(self.speak.json);
                 for target in targets {
                     let bytes = master.read(target.extension, target.address, target.length)?;
-                    rows.write_one(target, &target.fields(&bytes, description, master.order()))?;
+                    rows.write_one(target, &target.fields(&bytes, master.order()))?;
+                    let (fixed, stored) = target.axes(description);
+                    if !fixed.is_empty() {
+                        rows.write_one(target, &fixed.into_iter().map(Some).collect::<Vec<_>>())?;
+                    }
+                    for mut axis in stored {
+                        axis.settle(description, master)?;
+                        let bytes = master.read(axis.extension, axis.address, axis.length)?;
+                        rows.write_one(&axis, &axis.fields(&bytes, master.order()))?;
+                    }
                 }
                 Ok(())
             }
             What::Write { value, .. } => {
                 let [target] = targets else { bail!("one value is written at a time") };
-                self.write(target, value, description, master)
+                self.write(target, value, master)
             }
-            What::Poll(poll) => poll.run(targets, description, master, self.speak.json),
+            What::Poll(poll) => poll.run(targets, master, self.speak.json),
             What::Daq(daq) => daq.run(targets, master, self.speak.json),
         }
     }
@@ -302,19 +314,13 @@ impl Args {
         Ok(())
     }
 
-    fn write(
-        &self,
-        target: &Target,
-        value: &str,
-        description: Option<&Description>,
-        master: &mut Master<'_>,
-    ) -> anyhow::Result<()> {
-        let bytes = target.bytes(value, description, master.order())?;
+    fn write(&self, target: &Target, value: &str, master: &mut Master<'_>) -> anyhow::Result<()> {
+        let bytes = target.bytes(value, master.order())?;
         let length = bytes.len() as u32;
         let before = master.read(target.extension, target.address, length)?;
         ensure!(!interrupt::requested(), "ended by Ctrl-C; nothing was written");
         master.write(target.extension, target.address, &bytes)?;
-        let field = |bytes: &[u8]| target.fields(bytes, description, master.order());
+        let field = |bytes: &[u8]| target.fields(bytes, master.order());
         Rows::one(self.speak.json).write_change(target, &field(&before), &field(&bytes))
     }
 }

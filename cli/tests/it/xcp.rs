@@ -37,6 +37,49 @@ fn values_are_read_by_their_names_and_by_addresses() {
     assert_eq!(out, "30000000 80 0C 82 00 00 00 80 3F 43 41 4E 54 41 50 30 31\n");
 }
 
+/// Its axes have fewer points than there is room for; what is where depends on that.
+#[test]
+fn maps_and_structures_are_read_by_their_names() {
+    let directory = directory("maps");
+    let read = |what: &str| {
+        let (code, out, err) = cantap(&directory, &format!("xcp {ECU} read {what}"));
+        assert_eq!(code, Some(0), "{what}: {err}");
+        out
+    };
+    assert_eq!(
+        read("TorqueMap"),
+        "TorqueMap[0][0] 0 Nm\nTorqueMap[0][1] 120 Nm\nTorqueMap[1][0] 50 Nm\nTorqueMap[1][1] 180 Nm\n\
+         TorqueMap[2][0] 100 Nm\nTorqueMap[2][1] 160 Nm\n\
+         TorqueMap.AXIS_PTS_X[0] 1000 rpm\nTorqueMap.AXIS_PTS_X[1] 3000 rpm\nTorqueMap.AXIS_PTS_X[2] 6000 rpm\n\
+         TorqueMap.AXIS_PTS_Y[0] 0 %\nTorqueMap.AXIS_PTS_Y[1] 100 %\n"
+    );
+    let some = read("TorqueMap[2][1] Cylinder[1].Limits[0] Cylinder[0].Offset");
+    assert_eq!(some, "TorqueMap[2][1] 160 Nm\nCylinder[1].Limits[0] 30 %\nCylinder[0].Offset -1 deg\n");
+    let (code, out, err) = cantap(&directory, &format!("xcp {ECU} write TorqueMap[1][1] 200 --yes"));
+    assert_eq!((code, out.as_str()), (Some(0), "TorqueMap[1][1]: 180 Nm -> 200 Nm\n"), "{err}");
+    let line = format!("xcp {ECU} daq TorqueMap[1][1] Cylinder[1].Limits EngineSpeed -n 2 --csv");
+    let (code, out, err) = cantap(&directory, &line);
+    assert_eq!(code, Some(0), "{err}");
+    let lines: Vec<_> = out.lines().collect();
+    assert!(
+        lines[0]
+            .ends_with("stamp_us,TorqueMap[1][1],Cylinder[1].Limits[0],Cylinder[1].Limits[1],EngineSpeed"),
+        "{out}"
+    );
+    assert!(lines.len() == 3 && lines[1].contains(",180,30,40,"), "{out}");
+    for (what, expected) in [
+        ("read TorqueMap[9][9]", "'TorqueMap[9][9]': the last of TorqueMap is TorqueMap[3][2]"),
+        ("read Cylinder[0]", "'Cylinder[0]' is a structure; it has Cylinder[0].Offset, Cylinder[0].Limits"),
+        ("read EngineSped", "did you mean EngineSpeed?"),
+        ("write TorqueMap 5 --yes", "only single, whole numbers can be written by name"),
+    ] {
+        let (code, _, err) = cantap(&directory, &format!("xcp {ECU} {what}"));
+        assert!(code == Some(2) && err.contains(expected), "{what}: {err}");
+    }
+    let (code, _, err) = cantap(&directory, &format!("xcp {ECU} read TorqueMap[3][1]"));
+    assert!(code == Some(1) && err.contains("the ECU has fewer points now"), "{err}");
+}
+
 #[test]
 fn what_the_ecu_refuses_is_an_error_that_says_why() {
     let directory = directory("refused");
@@ -232,6 +275,70 @@ mod shared {
             send(frame(0x701, [0xFF] + answer));
         });
     "#;
+
+    /// An ECU whose addresses count words, with one list whose contents do not change and one of two packets of two values.
+    const WORDS: &str = r#"
+        on_frame("7F0", |f| {
+            let d = f.data;
+            let ok = |more| send(frame(0x7F1, [0xFF] + more));
+            if d[0] == 0xFF { ok.call([0x05, 0x02, 8, 8, 0, 1, 1]) }
+            else if d[0] == 0xF4 {
+                let bytes = [0];
+                for at in 0..d[1] { bytes += [(d[4] + at) & 0xFF, 0x10] }
+                ok.call(bytes)
+            }
+            else if d[0] == 0xDA { ok.call([0, 2, 0, 1, 0, 1, 0]) }
+            else if d[0] == 0xD9 { ok.call([2, 6, 2, 6, 0, 0, 0]) }
+            else if d[0] == 0xD8 { ok.call(if d[2] == 0 { [5, 1, 1, 0, 0] } else { [4, 2, 2, 0, 0] }) }
+            else if d[0] == 0xDF { ok.call([0, 0, 0, 0, 0, 1, 0]) }
+            else if d[0] == 0xE1 && d[2] != 1 { send(frame(0x7F1, [0xFE, 0x22])) }
+            else if d[0] == 0xDE { ok.call([0x10]) }
+            else {
+                ok.call([]);
+                if d[0] == 0xDD && d[1] == 1 {
+                    for sample in 0..3 {
+                        send(frame(0x7F1, [0x10, 1, sample, 2, sample]));
+                        send(frame(0x7F1, [0x11, 3, sample]));
+                    }
+                }
+            }
+        });
+    "#;
+
+    /// Both were refused: only lists that are made anew, and addresses that count bytes, were spoken.
+    #[test]
+    fn lists_that_are_ready_and_addresses_of_words_are_spoken() {
+        let served = Served::start("virtual:load=0", Stdio::null());
+        fs::write(served.folder.path().join("ecu.rhai"), WORDS).unwrap();
+        let mut node = served.run_node("ecu.rhai", &[]);
+        let ask = |more: &str| {
+            let mut command = Command::new(CANTAP);
+            command.args(["xcp", "-d", &served.at, "-b", "500k", "--pair", "7F0:7F1", "--timeout", "20s"]);
+            let output = command.args(more.split(' ')).output().unwrap();
+            let text = |bytes| String::from_utf8(bytes).unwrap();
+            (output.status.code(), text(output.stdout), text(output.stderr))
+        };
+        let (code, out, err) = ask("read 40:9");
+        assert_eq!((code, out.as_str()), (Some(0), "00000040 40 10 41 10 42 10 43 10 44\n"), "{err}");
+        let (code, out, err) = ask("daq 40:2 41:2 42:2 -n 3 --csv");
+        assert_eq!(code, Some(0), "{err}");
+        let rows: Vec<_> =
+            out.lines().map(|line| line.split(',').skip(2).collect::<Vec<_>>().join(",")).collect();
+        assert_eq!(
+            rows,
+            ["00000040,00000041,00000042", "01 00,02 00,03 00", "01 01,02 01,03 01", "01 02,02 02,03 02"]
+        );
+        let (code, _, err) = ask("daq 40:2 41:2 42:2 43:2 44:2");
+        let expected =
+            "list 0 has contents that do not change, list 1 has 2 packets of 2 values, and 3 are needed";
+        assert!(code == Some(1) && err.contains(expected), "{err}");
+        let (code, _, err) = ask("daq 40:1");
+        assert!(code == Some(1) && err.contains("the ECU measures multiples of 2"), "{err}");
+        let (code, _, err) = ask("write 40 01 --yes");
+        assert!(code == Some(1) && err.contains("count units of 2 bytes"), "{err}");
+        node.kill().unwrap();
+        node.wait().unwrap();
+    }
 
     /// Keys were sent by XCP only.
     #[test]

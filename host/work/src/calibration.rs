@@ -43,6 +43,8 @@ struct Connected {
     order: ByteOrder,
     max_cto: usize,
     max_dto: usize,
+    /// Bytes of an address unit.
+    unit: usize,
 }
 
 /// A master that talks to one slave. Whatever ends it, the slave is disconnected, so that nothing goes on.
@@ -121,6 +123,11 @@ impl<'d> Master<'d> {
         self.options.ccp.map(|(_, order)| order).or(self.connected.map(|connected| connected.order))
     }
 
+    /// Bytes of one of the slave's address units: 1, 2 or 4.
+    pub fn granularity(&self) -> usize {
+        self.connected.map_or(1, |connected| connected.unit)
+    }
+
     /// Sends a command and returns its answer.
     ///
     /// # Errors
@@ -154,6 +161,7 @@ impl<'d> Master<'d> {
             dialect,
             command,
             data,
+            skipped: self.granularity() - 1,
             is_repeatable,
             timeout_ns: ns(self.options.timeout),
             patience_ns: ns(self.options.patience),
@@ -183,7 +191,7 @@ impl<'d> Master<'d> {
     pub fn connect(&mut self) -> anyhow::Result<()> {
         if let Some((station, order)) = self.options.ccp {
             // From the first command on, the slave may be connected.
-            self.connected = Some(Connected { order, max_cto: 8, max_dto: 8 });
+            self.connected = Some(Connected { order, max_cto: 8, max_dto: 8, unit: 1 });
             let [low, high] = station.to_le_bytes();
             let connected = self.ask(vec![ccp::command::CONNECT, low, high], 0, true);
             if connected.is_err() {
@@ -195,7 +203,7 @@ impl<'d> Master<'d> {
         }
         let answer = self.ask(vec![command::CONNECT, 0], 0, true)?;
         // Whatever it says, it is to be disconnected.
-        self.connected = Some(Connected { order: ByteOrder::Little, max_cto: 8, max_dto: 8 });
+        self.connected = Some(Connected { order: ByteOrder::Little, max_cto: 8, max_dto: 8, unit: 1 });
         let &[_, mode, max_cto, first, second, protocol, transport, ..] = &answer[..] else {
             bail!("the ECU's answer to CONNECT has {} bytes; it has to have 7", answer.len());
         };
@@ -204,8 +212,9 @@ impl<'d> Master<'d> {
             order,
             max_cto: max_cto.into(),
             max_dto: order.number(&[first, second]) as usize,
+            unit: 1 << (mode >> 1 & 3).min(2),
         });
-        ensure!(mode & 6 == 0, "the ECU counts addresses in words, which is not supported");
+        ensure!(mode & 6 != 6, "the ECU counts addresses in units that XCP does not have");
         ensure!(
             protocol == 1 && transport == 1 && max_cto >= 8 && order.number(&[first, second]) >= 8,
             "the ECU's answer to CONNECT is not XCP 1.x on CAN: version {protocol} and {transport}, packets of {max_cto} and {} bytes",
@@ -251,9 +260,7 @@ impl<'d> Master<'d> {
         {
             let length = self.state()?.order.number(&length[..4]).min(255) as usize;
             // Unanswered, it may have moved on: it is not asked again.
-            if length > 0 {
-                self.ask_whether(vec![command::UPLOAD, length as u8], length, false)?.ok();
-            }
+            self.upload_text(length)?;
         }
         let Ok(info) = self.ask_whether(vec![command::GET_DAQ_PROCESSOR_INFO], 0, true)? else {
             return Ok(());
@@ -264,34 +271,48 @@ impl<'d> Master<'d> {
         for event in 0..events.min(256) {
             let command = [&[command::GET_DAQ_EVENT_INFO, 0][..], &self.number(event, 2)].concat();
             let Ok(about) = self.ask_whether(command, 0, true)? else { break };
-            if let Some(length) = about.get(2).filter(|length| **length > 0) {
-                self.ask_whether(vec![command::UPLOAD, *length], (*length).into(), false)?.ok();
-            }
+            self.upload_text(about.get(2).copied().unwrap_or_default().into())?;
         }
         Ok(())
     }
 
-    /// Reads memory.
+    /// Fetches a text of so many bytes, if it has any, which the slave has just offered.
+    fn upload_text(&mut self, length: usize) -> anyhow::Result<()> {
+        let elements = length.div_ceil(self.granularity());
+        if elements > 0 {
+            let data = elements * self.granularity();
+            self.ask_whether(vec![command::UPLOAD, elements as u8], data, false)?.ok();
+        }
+        Ok(())
+    }
+
+    /// Reads so many bytes of the memory, from this address in the slave's units.
     ///
     /// # Errors
     ///
     /// The slave does not answer or refuses.
     pub fn read(&mut self, extension: u8, address: u32, length: u32) -> anyhow::Result<Vec<u8>> {
         ensure!(length <= MOST_READ, "at most {MOST_READ} bytes are read at once");
-        let step = if self.is_ccp() { 5 } else { self.state()?.max_cto.min(MOST_FRAME) - 1 };
+        let unit = self.granularity();
+        // An answer's data begin at a whole unit.
+        let room = if self.is_ccp() { 5 } else { self.state()?.max_cto.min(MOST_FRAME) - unit };
+        let whole = (length as usize).next_multiple_of(unit);
         let mut data = Vec::new();
-        while data.len() < length as usize {
-            let at = address.checked_add(data.len() as u32).context("it is beyond the last address")?;
-            let count = step.min(length as usize - data.len());
+        while data.len() < whole {
+            let at =
+                address.checked_add((data.len() / unit) as u32).context("it is beyond the last address")?;
+            let elements = (room / unit).min((whole - data.len()) / unit);
+            let count = elements * unit;
             let place = self.number(at.into(), 4);
             let command = if self.is_ccp() {
                 [&[ccp::command::SHORT_UP, count as u8, extension][..], &place].concat()
             } else {
-                [&[command::SHORT_UPLOAD, count as u8, 0, extension][..], &place].concat()
+                [&[command::SHORT_UPLOAD, elements as u8, 0, extension][..], &place].concat()
             };
             let answer = self.ask(command, count, true)?;
             data.extend_from_slice(&answer[..count]);
         }
+        data.truncate(length as usize);
         Ok(data)
     }
 
@@ -301,6 +322,12 @@ impl<'d> Master<'d> {
     ///
     /// The slave does not answer or refuses, or has something else there afterwards.
     pub fn write(&mut self, extension: u8, address: u32, bytes: &[u8]) -> anyhow::Result<()> {
+        let unit = self.granularity();
+        ensure!(
+            bytes.len().is_multiple_of(unit),
+            "the ECU's addresses count units of {unit} bytes; {} bytes are not a whole number of them",
+            bytes.len()
+        );
         let place = self.number(address.into(), 4);
         if self.is_ccp() {
             self.ask([&[ccp::command::SET_MTA, 0, extension][..], &place].concat(), 0, true)?;
@@ -309,8 +336,14 @@ impl<'d> Master<'d> {
             }
         } else {
             self.ask([&[command::SET_MTA, 0, 0, extension][..], &place].concat(), 0, true)?;
-            for part in bytes.chunks(self.state()?.max_cto.min(MOST_FRAME) - 2) {
-                self.ask([&[command::DOWNLOAD, part.len() as u8][..], part].concat(), 0, false)?;
+            // Data begin at a whole unit.
+            let head = unit.max(2);
+            let room = (self.state()?.max_cto.min(MOST_FRAME) - head) / unit * unit;
+            for part in bytes.chunks(room) {
+                let mut command = vec![command::DOWNLOAD, (part.len() / unit) as u8];
+                command.resize(head, 0);
+                command.extend_from_slice(part);
+                self.ask(command, 0, false)?;
             }
         }
         let back = self.read(extension, address, bytes.len() as u32)?;

@@ -1,10 +1,10 @@
 //! Values again and again: asked for one by one, or sent by the ECU itself.
 
+use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use cantap_protocols::a2l::Description;
-use cantap_protocols::{Event, EventKind, Field};
+use cantap_protocols::{Event, EventKind, Field, Value};
 use cantap_work::calibration::{Master, RunningList};
 use cantap_work::interrupt;
 
@@ -61,13 +61,7 @@ fn columns(targets: &[Target]) -> Vec<String> {
 
 impl PollArgs {
     /// Polls until it ends.
-    pub fn run(
-        &self,
-        targets: &[Target],
-        description: Option<&Description>,
-        master: &mut Master<'_>,
-        json: bool,
-    ) -> anyhow::Result<()> {
+    pub fn run(&self, targets: &[Target], master: &mut Master<'_>, json: bool) -> anyhow::Result<()> {
         let mut rows = Rows::table(columns(targets), json, self.csv, false);
         let started = Instant::now();
         let mut due = Duration::ZERO;
@@ -80,7 +74,7 @@ impl PollArgs {
                 if read.is_err() && interrupt::requested() {
                     return Ok(());
                 }
-                row.values.extend(target.fields(&read?, description, master.order()));
+                row.values.extend(target.fields(&read?, master.order()));
             }
             row.time_ns = master.take_events().last().map_or(0, |event| event.time_ns);
             rows.write(&row)?;
@@ -159,6 +153,9 @@ impl DaqArgs {
     pub fn run(&self, targets: &[Target], master: &mut Master<'_>, json: bool) -> anyhow::Result<()> {
         let values: Vec<_> = targets.iter().flat_map(Target::sampled).collect();
         let list = master.start_list(&values, self.event)?;
+        // What is in a map that may have fewer points, a listener does not know.
+        let by_address: HashMap<_, _> = targets.iter().flat_map(Target::by_address).collect();
+        let order = master.order();
         let mut rows = Rows::table(columns(targets), json, self.csv, !master.is_ccp());
         let mut collector = Collector::new(columns(targets), &list);
         let started = Instant::now();
@@ -167,7 +164,15 @@ impl DaqArgs {
             let left = self.time.map(|time| time.saturating_sub(started.elapsed()));
             is_over = left.is_some_and(|left| left.is_zero());
             master.speaking.listen(left.unwrap_or(LOOK_EVERY).min(LOOK_EVERY))?;
-            for event in master.take_events() {
+            for mut event in master.take_events() {
+                for field in &mut event.fields {
+                    if let Value::Bytes(bytes) = &field.value
+                        && let Some((target, at)) = by_address.get(&*field.name)
+                        && let Some(named) = target.field(*at, bytes, order)
+                    {
+                        *field = named;
+                    }
+                }
                 if event.kind == EventKind::Notification {
                     eprintln!("cantap: the ECU reports {}{}", event.title, details(&event.fields));
                     // Nothing more comes.

@@ -20,8 +20,8 @@ pub struct Description {
     name: String,
     objects: Vec<MemoryObject>,
     by_name: HashMap<String, usize>,
-    /// Objects and which of their values, by extension and address.
-    by_address: BTreeMap<(u8, u32), Vec<(usize, u32)>>,
+    /// Objects and which of their values, by extension and address in bytes.
+    by_address: BTreeMap<(u8, u64), Vec<(usize, u32)>>,
     elements: usize,
     transport: EcuConnection,
     /// What was not understood, in words.
@@ -37,14 +37,14 @@ impl Description {
     /// Adds an object.
     pub(super) fn add(&mut self, object: MemoryObject) {
         let place = self.objects.len();
-        let step = if object.is_text { object.size() } else { object.data_type.size() } as u32;
-        let count = if object.is_text { 1 } else { object.count.min(MOST_OF_ARRAY) };
+        let count = if object.stays() { object.count().min(MOST_OF_ARRAY) } else { 0 };
+        let begin = u64::from(object.address) * u64::from(self.granularity()) + u64::from(object.offset);
         for element in 0..count {
             if self.elements == MOST_ELEMENTS {
                 break;
             }
             self.elements += 1;
-            let Some(address) = object.address.checked_add(element * step) else { break };
+            let address = begin + u64::from(object.element_offset(element));
             self.by_address.entry((object.extension, address)).or_default().push((place, element));
         }
         self.by_name.entry(object.name.clone()).or_insert(place);
@@ -68,6 +68,27 @@ impl Description {
         }
         let mut same = self.objects.iter().filter(|object| object.name.eq_ignore_ascii_case(name));
         same.next().filter(|_| same.next().is_none())
+    }
+
+    /// The object with this name, or the one of which the name says an element, as `Table[3][2]`.
+    pub fn element(&self, name: &str) -> Option<(&MemoryObject, Option<u32>)> {
+        let mut indices = Vec::new();
+        let mut rest = name;
+        loop {
+            if let Some(object) = self.object(rest) {
+                indices.reverse();
+                let element = if indices.is_empty() { None } else { Some(object.element(&indices)?) };
+                return Some((object, element));
+            }
+            let (before, index) = rest.strip_suffix(']')?.rsplit_once('[')?;
+            indices.push(index.parse().ok()?);
+            rest = before;
+        }
+    }
+
+    /// Bytes of one of XCP's address units: 1, 2 or 4.
+    pub fn granularity(&self) -> u8 {
+        self.transport.granularity.max(1)
     }
 
     /// The identifiers of XCP.
@@ -95,19 +116,17 @@ impl Description {
         &self.transport.events
     }
 
-    /// What is in these bytes of the memory: each value that is whole within them.
+    /// What is in these bytes of the memory, from this address in the ECU's units: each value that is whole within them.
     pub fn fields(&self, extension: u8, address: u32, bytes: &[u8], order: Option<ByteOrder>) -> Vec<Field> {
-        let Some(last) = u32::try_from(bytes.len()).ok().and_then(|length| length.checked_sub(1)) else {
-            return Vec::new();
-        };
-        let range = (extension, address)..=(extension, address.saturating_add(last));
+        let Some(last) = (bytes.len() as u64).checked_sub(1) else { return Vec::new() };
+        let begin = u64::from(address) * u64::from(self.granularity());
+        let range = (extension, begin)..=(extension, begin + last);
         let mut fields = Vec::new();
         for ((_, at), places) in self.by_address.range(range) {
             for &(place, element) in places {
                 let object = &self.objects[place];
-                let size = if object.is_text { object.size() } else { object.data_type.size() };
-                let from = (at - address) as usize;
-                if let Some(bytes) = bytes.get(from..from.saturating_add(size)) {
+                let from = (at - begin) as usize;
+                if let Some(bytes) = bytes.get(from..from.saturating_add(object.element_size())) {
                     fields.push(object.field(element, bytes, order));
                 }
             }
@@ -123,9 +142,10 @@ impl Description {
         bytes: &[u8],
         order: Option<ByteOrder>,
     ) -> Vec<Field> {
-        let exact = self.by_address.get(&(extension, address)).into_iter().flatten();
+        let begin = u64::from(address) * u64::from(self.granularity());
+        let exact = self.by_address.get(&(extension, begin)).into_iter().flatten();
         let exact = exact.map(|&(place, element)| (&self.objects[place], element));
-        let exact = exact.filter(|(object, _)| !object.is_text && object.data_type.size() == bytes.len());
+        let exact = exact.filter(|(object, _)| !object.is_text() && object.data_type.size() == bytes.len());
         let exact: Vec<_> = exact.map(|(object, element)| object.field(element, bytes, order)).collect();
         if exact.is_empty() { self.fields(extension, address, bytes, order) } else { exact }
     }

@@ -31,6 +31,8 @@ pub struct EcuConnection {
     pub ccp_order: Option<ByteOrder>,
     /// XCP's events.
     pub events: Vec<DaqEvent>,
+    /// Bytes of one of XCP's address units; 0 if it is not said.
+    pub granularity: u8,
 }
 
 /// A word of IF_DATA.
@@ -146,6 +148,15 @@ impl EcuConnection {
             if let (Some(master), Some(slave), None) = (ids.0, ids.1, self.xcp) {
                 self.xcp = Some(MasterSlave { master: identifier(master), slave: identifier(slave) });
             }
+        }
+        let units = [("BYTE", 1), ("WORD", 2), ("DWORD", 4)];
+        let unit = tokens.iter().find_map(|token| {
+            let Token::Word(word) = token else { return None };
+            let unit = word.strip_prefix("ADDRESS_GRANULARITY_")?;
+            units.iter().find(|(name, _)| *name == unit).map(|(_, size)| *size)
+        });
+        if let (Some(size), 0) = (unit, self.granularity) {
+            self.granularity = size;
         }
         for event in blocks(&tokens, "EVENT") {
             let [Token::Text(name), Token::Text(_), Token::Number(number), rest @ ..] = event else {

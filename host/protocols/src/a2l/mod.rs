@@ -1,22 +1,32 @@
 //! A2lDescriptions of what is in an ECU's memory: A2L files (ASAM MCD-2 MC, versions 1.31 to 1.71).
 //!
-//! Read are measured values (MEASUREMENT) and parameters (CHARACTERISTIC: values, blocks of values, text) with their conversions, and, of
-//! IF_DATA, the identifiers and events of XCP and CCP. Curves, maps, formulas with operations on bits, and the structures of version 1.7 are left out, and listed.
+//! Read are measured values (MEASUREMENT), parameters (CHARACTERISTIC: values, blocks of values, text, curves, maps and cuboids with their
+//! axes) and structures of them (INSTANCE), with their conversions, and, of IF_DATA, the identifiers and events of XCP and CCP. Formulas with
+//! operations on bits, and what is behind pointers, are left out, and listed.
 
+mod axes;
 mod conversion;
+mod data_type;
 mod description;
 mod if_data;
 mod load;
+#[cfg(test)]
+mod map_tests;
+mod module;
 mod nesting;
 mod object;
+mod record;
+mod shown;
+mod structures;
 #[cfg(test)]
 mod tests;
 
 pub use conversion::{Conversion, Meaning, Texts};
+pub use data_type::{DataType, Dimension};
 pub use description::{A2lDescriptions, Description};
 pub use if_data::{DaqEvent, EcuConnection};
 pub use load::{A2lError, Include};
-pub use object::{Bits, DataType, MemoryObject, ValueError};
+pub use object::{Axis, Bits, MemoryObject, PartOfRecord, Shape, ValueError};
 
 use crate::Field;
 use crate::calibration::lists::ListEntry;

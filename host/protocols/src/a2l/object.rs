@@ -1,30 +1,14 @@
 //! What is in the ECU's memory: measured values and parameters.
 
+use std::sync::Arc;
+
 use half::f16;
 
 use super::conversion::{Conversion, Meaning, Texts};
+use super::data_type::{DataType, Dimension};
+use super::record::{Record, Role};
 use crate::calibration::parts::ByteOrder;
 use crate::{Field, Value};
-
-/// How a number is stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum DataType {
-    /// Without a sign, of 1, 2, 4 or 8 bytes.
-    Unsigned(u8),
-    /// In two's complement, of 1, 2, 4 or 8 bytes.
-    Signed(u8),
-    /// IEEE 754, of 2, 4 or 8 bytes.
-    Float(u8),
-}
-
-impl DataType {
-    /// Bytes of a number.
-    pub const fn size(self) -> usize {
-        match self {
-            Self::Unsigned(size) | Self::Signed(size) | Self::Float(size) => size as usize,
-        }
-    }
-}
 
 /// Which bits of a number are meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,6 +21,39 @@ pub struct Bits {
     pub is_signed: bool,
 }
 
+/// How many values an object has.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Shape {
+    /// One number without dimensions, otherwise an array, the first index in the name first.
+    Numbers(Vec<Dimension>),
+    /// Text of so many bytes.
+    Text(u32),
+}
+
+/// An axis of a curve or a map.
+#[derive(Clone, Debug)]
+pub enum Axis {
+    /// Its points are computed, and the same always: as fields.
+    Fixed(Vec<Field>),
+    /// Its points are the object with this name.
+    Stored(String),
+    /// It is not known.
+    Unknown,
+}
+
+/// How an object is part of a record whose axes have fewer points at times.
+#[derive(Clone, Debug)]
+pub struct PartOfRecord {
+    pub(super) record: Arc<Record>,
+    pub(super) role: Role,
+    /// Where the record begins.
+    pub(super) address: u32,
+    /// The most points of each axis.
+    pub(super) most: Vec<u32>,
+    /// The names of the objects that say how many points each axis has.
+    pub(super) numbers: Vec<Option<String>>,
+}
+
 /// A value in the memory.
 #[derive(Clone, Debug)]
 pub struct MemoryObject {
@@ -46,8 +63,10 @@ pub struct MemoryObject {
     pub description: String,
     /// The address extension.
     pub extension: u8,
-    /// The address.
+    /// The address, in the ECU's units.
     pub address: u32,
+    /// Bytes beyond that address.
+    pub offset: u32,
     /// How it is stored.
     pub data_type: DataType,
     /// The order of its bytes; `None` for the connection's.
@@ -60,10 +79,12 @@ pub struct MemoryObject {
     pub status: Texts,
     /// The value's unit.
     pub unit: String,
-    /// How many there are, one after another.
-    pub count: u32,
-    /// It is text, of so many bytes.
-    pub is_text: bool,
+    /// How many there are.
+    pub shape: Shape,
+    /// The axes of a curve or a map.
+    pub axes: Vec<Axis>,
+    /// The record that it is part of, if that may be shorter than the most.
+    pub(super) part: Option<PartOfRecord>,
     /// A parameter, which may be written; otherwise a measured value.
     pub is_parameter: bool,
     /// The least and the greatest value.
@@ -86,7 +107,7 @@ pub enum ValueError {
     /// The type of the number has no room for it.
     #[error("the number has no room for this value")]
     NoRoom,
-    /// Objects of several values, or of some bits, are not written.
+    /// Arrays as a whole, texts, and some bits of a number are not written.
     #[error("only single, whole numbers can be written by name; write bytes to its address instead")]
     NotSingle,
     /// The order of its bytes is not known.
@@ -95,10 +116,121 @@ pub enum ValueError {
 }
 
 impl MemoryObject {
-    /// Bytes of all of it.
-    pub const fn size(&self) -> usize {
-        let count = self.count as usize;
-        if self.is_text { count } else { self.data_type.size().saturating_mul(count) }
+    /// Whether it is text.
+    pub const fn is_text(&self) -> bool {
+        matches!(self.shape, Shape::Text(_))
+    }
+
+    /// How many numbers it has; 1 of a text.
+    pub fn count(&self) -> u32 {
+        match &self.shape {
+            Shape::Numbers(dimensions) => {
+                let counts = dimensions.iter().map(|dimension| dimension.count);
+                counts.fold(1, u32::saturating_mul)
+            }
+            Shape::Text(_) => 1,
+        }
+    }
+
+    /// Bytes of one of them; of a text, all of it.
+    pub const fn element_size(&self) -> usize {
+        match self.shape {
+            Shape::Numbers(_) => self.data_type.size(),
+            Shape::Text(length) => length as usize,
+        }
+    }
+
+    /// Bytes from the first of them to the end of the last, whatever is between them.
+    pub fn size(&self) -> usize {
+        let Shape::Numbers(dimensions) = &self.shape else { return self.element_size() };
+        dimensions.iter().fold(self.data_type.size(), |size, dimension| {
+            let steps = dimension.count.saturating_sub(1) as usize;
+            size.saturating_add(steps.saturating_mul(dimension.stride as usize))
+        })
+    }
+
+    /// The indices of one of them: the last counts fastest.
+    pub fn indices(&self, element: u32) -> Vec<u32> {
+        let Shape::Numbers(dimensions) = &self.shape else { return Vec::new() };
+        let mut left = element;
+        let mut indices: Vec<_> = dimensions
+            .iter()
+            .rev()
+            .map(|dimension| {
+                let index = left % dimension.count.max(1);
+                left /= dimension.count.max(1);
+                index
+            })
+            .collect();
+        indices.reverse();
+        indices
+    }
+
+    /// Which of them has these indices.
+    pub fn element(&self, indices: &[u32]) -> Option<u32> {
+        let Shape::Numbers(dimensions) = &self.shape else { return None };
+        if dimensions.len() != indices.len() || dimensions.is_empty() {
+            return None;
+        }
+        dimensions.iter().zip(indices).try_fold(0_u32, |element, (dimension, index)| {
+            (*index < dimension.count).then_some(())?;
+            element.checked_mul(dimension.count)?.checked_add(*index)
+        })
+    }
+
+    /// The name of one of them.
+    pub fn element_name(&self, element: u32) -> String {
+        let indices = self.indices(element).into_iter().map(|index| format!("[{index}]"));
+        indices.fold(self.name.clone(), |name, index| name + &index)
+    }
+
+    /// Bytes from the first of them in the memory to this one.
+    pub fn element_offset(&self, element: u32) -> u32 {
+        let Shape::Numbers(dimensions) = &self.shape else { return 0 };
+        let steps = dimensions.iter().zip(self.indices(element)).map(|(dimension, index)| {
+            let index = if dimension.is_reversed { dimension.count - 1 - index } else { index };
+            index.saturating_mul(dimension.stride)
+        });
+        steps.fold(0, u32::saturating_add)
+    }
+
+    /// The names of the objects that say how many points its axes have now, by axis: what it is depends on them.
+    pub fn numbers(&self) -> &[Option<String>] {
+        self.part.as_ref().map_or(&[], |part| &part.numbers)
+    }
+
+    /// The same, when its axes have so many points (`None` for the most).
+    ///
+    /// # Errors
+    ///
+    /// An axis has none, or more than it may have.
+    pub fn with_points(&self, counts: &[Option<u32>]) -> Result<Self, &'static str> {
+        let Some(part) = &self.part else { return Ok(self.clone()) };
+        let now = counts.iter().zip(&part.most).map(|(count, most)| count.unwrap_or(*most));
+        let now: Vec<_> = now.collect();
+        if now.iter().zip(&part.most).any(|(now, most)| *now == 0 || now > most) {
+            return Err("the ECU says that an axis of it has no points, or more than there is room for");
+        }
+        let place = part.record.place(part.role, &now, &part.most)?;
+        let shape = Shape::Numbers(place.dimensions);
+        Ok(Self { address: part.address, offset: place.offset, shape, part: None, ..self.clone() })
+    }
+
+    /// Whether the first of them is always at the same place, and those that follow too.
+    pub(super) fn stays(&self) -> bool {
+        let Some(part) = &self.part else { return true };
+        let least: Vec<_> = part
+            .numbers
+            .iter()
+            .zip(&part.most)
+            .map(|(number, most)| number.as_ref().map_or(*most, |_| 1))
+            .collect();
+        let place = |counts: &[u32]| {
+            let place = part.record.place(part.role, counts, &part.most).ok()?;
+            let strides = place.dimensions.iter().map(|one| (one.stride, one.is_reversed && one.count > 1));
+            Some((place.offset, strides.collect::<Vec<_>>()))
+        };
+        place(&least) == place(&part.most)
     }
 
     /// The number in these bytes.
@@ -139,12 +271,8 @@ impl MemoryObject {
 
     /// The field for one of its values; the connection's order counts where it has none.
     pub fn field(&self, element: u32, bytes: &[u8], order: Option<ByteOrder>) -> Field {
-        let name = if self.count > 1 && !self.is_text {
-            format!("{}[{element}]", self.name)
-        } else {
-            self.name.clone()
-        };
-        if self.is_text {
+        let name = self.element_name(element);
+        if self.is_text() {
             let end = bytes.iter().position(|byte| *byte == 0).unwrap_or(bytes.len());
             let text: String = bytes[..end].iter().map(|byte| char::from(*byte)).collect();
             return Field::text(name, text);
@@ -169,13 +297,13 @@ impl MemoryObject {
         }
     }
 
-    /// The bytes for a value, given as a number or one of its texts.
+    /// The bytes for one of its values, given as a number or one of its texts.
     ///
     /// # Errors
     ///
     /// It is no value of this object, or beyond its limits.
     pub fn bytes(&self, text: &str, order: Option<ByteOrder>) -> Result<Vec<u8>, ValueError> {
-        if self.count != 1 || self.bits.is_some() || self.is_text {
+        if self.bits.is_some() || self.is_text() {
             return Err(ValueError::NotSingle);
         }
         let of_texts = match &self.conversion {
@@ -268,14 +396,16 @@ mod tests {
             description: String::new(),
             extension: 0,
             address: 0,
+            offset: 0,
             data_type,
             order: None,
             bits: None,
             conversion,
             status: Texts::default(),
             unit: "rpm".to_owned(),
-            count: 1,
-            is_text: false,
+            shape: Shape::Numbers(Vec::new()),
+            axes: Vec::new(),
+            part: None,
             is_parameter: true,
             limits: (0.0, 8000.0),
         }

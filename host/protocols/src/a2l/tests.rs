@@ -31,7 +31,8 @@ ASAP2_VERSION 1 61
 /begin MEASUREMENT Curved "" UBYTE Curve 1 0 0 1 ECU_ADDRESS 0x20000021 /end MEASUREMENT
 /begin CHARACTERISTIC Idle "" VALUE 0x30000000 Word 0 Rpm 500 1500 /end CHARACTERISTIC
 /begin CHARACTERISTIC Name "" ASCII 0x30000010 Byte 0 NO_COMPU_METHOD 0 255 NUMBER 8 /end CHARACTERISTIC
-/begin CHARACTERISTIC Map "" MAP 0x30000020 Word 0 Rpm 0 1 /end CHARACTERISTIC
+/begin CHARACTERISTIC Map "" MAP 0x30000020 Word 0 Rpm 0 1
+  /begin AXIS_DESCR STD_AXIS NO_INPUT_QUANTITY Rpm 2 0 8000 DEPOSIT DIFFERENCE /end AXIS_DESCR /end CHARACTERISTIC
 /begin RECORD_LAYOUT Word FNC_VALUES 1 UWORD ROW_DIR DIRECT /end RECORD_LAYOUT
 /begin RECORD_LAYOUT Byte FNC_VALUES 1 UBYTE ROW_DIR DIRECT /end RECORD_LAYOUT
 /begin COMPU_METHOD Rpm "" RAT_FUNC "%8.2" "rpm" COEFFS 0 4 0 0 0 1 /end COMPU_METHOD
@@ -98,7 +99,10 @@ fn the_connection_stands_in_if_data() {
 #[test]
 fn what_is_left_out_is_listed() {
     let issues = ecu().issues;
-    let expected = ["Odd: the formula of Formula is not evaluated", "Map: curves and maps are left out"];
+    let expected = [
+        "Odd: the formula of Formula is not evaluated",
+        "Map: the points of an axis are stored as differences",
+    ];
     assert_eq!(issues, expected);
 }
 

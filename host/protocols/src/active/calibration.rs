@@ -42,6 +42,8 @@ pub struct CommandRequest {
     pub command: Vec<u8>,
     /// How many bytes of data answer it, in one response of XCP or several.
     pub data: usize,
+    /// Bytes between the first byte of such a response and its data: XCP's data begin at a whole address unit.
+    pub skipped: usize,
     /// It does the same if it is sent twice.
     pub is_repeatable: bool,
     /// How long the answer may take, in nanoseconds.
@@ -252,7 +254,8 @@ impl CalibrationCommand {
                     return;
                 }
                 let left = expected - self.gathered.len();
-                self.gathered.extend_from_slice(&rest[..rest.len().min(left)]);
+                let part = rest.get(self.request.skipped..).unwrap_or_default();
+                self.gathered.extend_from_slice(&part[..part.len().min(left)]);
                 let got = self.gathered.len();
                 if got == expected {
                     self.end = Some(Ok(std::mem::take(&mut self.gathered)));

@@ -15,6 +15,7 @@ fn request(dialect: Dialect, command: &[u8], data: usize) -> CommandRequest {
         dialect,
         command: command.to_vec(),
         data,
+        skipped: 0,
         is_repeatable: true,
         timeout_ns: 100_000_000,
         patience_ns: 2_000_000_000,

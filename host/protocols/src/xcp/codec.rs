@@ -37,11 +37,13 @@ pub mod command {
     pub const SET_DAQ_PTR: u8 = 0xE2;
     pub const WRITE_DAQ: u8 = 0xE1;
     pub const SET_DAQ_LIST_MODE: u8 = 0xE0;
+    pub const GET_DAQ_LIST_MODE: u8 = 0xDF;
     pub const START_STOP_DAQ_LIST: u8 = 0xDE;
     pub const START_STOP_SYNCH: u8 = 0xDD;
     pub const GET_DAQ_CLOCK: u8 = 0xDC;
     pub const GET_DAQ_PROCESSOR_INFO: u8 = 0xDA;
     pub const GET_DAQ_RESOLUTION_INFO: u8 = 0xD9;
+    pub const GET_DAQ_LIST_INFO: u8 = 0xD8;
     pub const GET_DAQ_EVENT_INFO: u8 = 0xD7;
     pub const FREE_DAQ: u8 = 0xD6;
     pub const ALLOC_DAQ: u8 = 0xD5;
@@ -273,7 +275,7 @@ pub const COMMANDS: &[CommandDefinition] = &[
         &[],
     ),
     command(
-        0xDF,
+        command::GET_DAQ_LIST_MODE,
         "GET_DAQ_LIST_MODE",
         LIST,
         &[
@@ -324,7 +326,7 @@ pub const COMMANDS: &[CommandDefinition] = &[
         ],
     ),
     command(
-        0xD8,
+        command::GET_DAQ_LIST_INFO,
         "GET_DAQ_LIST_INFO",
         LIST,
         &[Hex("properties", 1), Number("odts", 1), Number("entries", 1), Number("event", 2)],

@@ -317,12 +317,15 @@ impl XcpConnection {
     /// Appends bytes of the memory, and what is in them.
     fn push_memory(&self, at: Option<(u8, u32)>, bytes: &[u8], fields: &mut Vec<Field>) {
         fields.push(Field::bytes("value", bytes));
-        if let (Some(description), Some((extension, address))) = (&self.description, at) {
-            // The addresses of a description count bytes where one unit is a byte.
-            if self.state.granularity == 1 {
-                fields.extend(description.fields(extension, address, bytes, self.state.order));
-            }
+        if let (Some(description), Some((extension, address))) = (self.described(), at) {
+            fields.extend(description.fields(extension, address, bytes, self.state.order));
         }
+    }
+
+    /// The description, if its addresses count in the same units as the slave's.
+    fn described(&self) -> Option<&Description> {
+        let description = self.description.as_deref()?;
+        (usize::from(description.granularity()) == self.state.granularity).then_some(description)
     }
 
     fn packet(&self, record: &TraceRecord, data: &[u8]) -> Event {
@@ -346,13 +349,7 @@ impl XcpConnection {
             event.fields.push(self.state.layout.stamp_field(stamp, order));
         }
         for (entry, bytes) in packet.entries {
-            crate::a2l::push_entry(
-                &mut event.fields,
-                self.description.as_deref(),
-                entry,
-                bytes,
-                self.state.order,
-            );
+            crate::a2l::push_entry(&mut event.fields, self.described(), entry, bytes, self.state.order);
         }
         event
     }

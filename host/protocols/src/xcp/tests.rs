@@ -247,3 +247,39 @@ fn diagnostics_are_not_taken_for_it() {
         [(0.0, "7E0#0210030000000000"), (1.0, "7E8#065003003201F400"), (2.0, "7E0#FF00"), (3.0, "7E8#FF00")];
     assert_eq!(found(&frames), [Protocol::Uds]);
 }
+
+/// Frames of CAN FD hold packets of up to 64 bytes, and are filled up to the next length that there is.
+#[test]
+fn packets_in_frames_of_can_fd_are_taken_apart() {
+    let mut frames = vec![(0.0, "7F0##1FF00000000000000"), (1.0, "7F1##1FF050040400001010000000000")];
+    let filled = |bytes: &str, length: usize| -> &'static str {
+        let data = bytes.len() - bytes.find("##1").unwrap() - 3;
+        Box::leak(format!("{bytes}{}", "0".repeat(2 * length - data)).into_boxed_str())
+    };
+    frames[1].1 = filled("7F1##1FF05004040000101", 12);
+    frames.extend([
+        (2.0, "7F0##1F414000000100020"),
+        (3.0, filled("7F1##1FF0102030405060708090A0B0C0D0E0F1011121314", 24)),
+        (4.0, "7F0##1E20000000000"),
+        (4.1, "7F1##1FF"),
+    ]);
+    for (at, size, address) in [(5.0, 8, 0x10), (6.0, 4, 0x18), (7.0, 1, 0x1C)] {
+        let line = format!("7F0##1E1FF{size:02X}00{address:02X}000020");
+        frames.extend([(at, &*line.leak()), (at + 0.1, "7F1##1FF")]);
+    }
+    frames.extend([
+        (8.0, "7F0##1E000000000000100"),
+        (8.1, "7F1##1FF"),
+        (8.2, "7F0##1DE010000"),
+        (8.3, "7F1##1FF00"),
+        (9.0, filled("7F1##1000102030405060708090A0B0C0D", 16)),
+    ]);
+    let all = event_lines(Xcp::new(Known::default()), &frames);
+    assert!(all[0].contains("max_cto 64, max_dto 64"), "{}", all[0]);
+    let value = "value 01 02 03 04 05 06 07 08 09 0A 0B 0C 0D 0E 0F 10 11 12 13 14";
+    assert!(all[1].contains(value), "{}", all[1]);
+    assert_eq!(
+        all.last().unwrap(),
+        "xcp 7F1 > 7F0 DAQ: daq 0, odt 0, 20000010 01 02 03 04 05 06 07 08, 20000018 09 0A 0B 0C, 2000001C 0D"
+    );
+}

@@ -31,23 +31,34 @@ const MOST_WAITING: usize = 256;
 const HALF_PERIOD_MS: u64 = 2000;
 const MEASURED_AT: u32 = 0x2000_0000;
 const PARAMETERS_AT: u32 = 0x3000_0000;
-/// The parameters before the program's name, which is not written.
-const WRITABLE: usize = 8;
+/// The program's name among the parameters, which is not written.
+const PROGRAM: std::ops::Range<usize> = 8..16;
+/// A map behind it: its axes have 3 of 4 and 2 of 3 points; engine speeds, pedal in per cent, torques row by row.
+const MAP: [u8; 2] = [3, 2];
+const MAP_SPEEDS: [u16; 3] = [4000, 12_000, 24_000];
+const MAP_PEDAL: [u8; 2] = [0, 100];
+const MAP_TORQUES: [u16; 6] = [0, 50, 100, 120, 180, 160];
+/// Two cylinders: an offset and two limits of each.
+const CYLINDERS: [u8; 8] = [0xFE, 0xFF, 10, 20, 3, 0, 30, 40];
 
 /// What the ECU measures, and its parameters.
 #[derive(Debug)]
 struct Ecu {
     measured: [u8; 14],
-    parameters: [u8; 16],
+    parameters: [u8; 48],
 }
 
 impl Ecu {
     fn new() -> Self {
-        let mut parameters = [0; 16];
+        let mut parameters = [0; 48];
         parameters[..2].copy_from_slice(&3200_u16.to_le_bytes());
         parameters[2] = 130;
         parameters[4..8].copy_from_slice(&1_f32.to_le_bytes());
-        parameters[8..].copy_from_slice(b"CANTAP01");
+        parameters[PROGRAM].copy_from_slice(b"CANTAP01");
+        let words = |words: &[u16]| words.iter().flat_map(|word| word.to_le_bytes()).collect::<Vec<_>>();
+        let map = [&MAP[..], &words(&MAP_SPEEDS), &MAP_PEDAL, &words(&MAP_TORQUES)].concat();
+        parameters[16..16 + map.len()].copy_from_slice(&map);
+        parameters[40..].copy_from_slice(&CYLINDERS);
         Self { measured: [0; 14], parameters }
     }
 
@@ -91,10 +102,11 @@ impl Memory for Ecu {
     }
 
     fn write(&mut self, extension: u8, address: u32, bytes: &[u8]) -> bool {
-        let Some(range) = place(PARAMETERS_AT, WRITABLE, address, bytes.len()).filter(|_| extension == 0)
-        else {
-            return false;
+        let range = place(PARAMETERS_AT, self.parameters.len(), address, bytes.len());
+        let is_writable = |range: &std::ops::Range<usize>| {
+            extension == 0 && (range.end <= PROGRAM.start || range.start >= PROGRAM.end)
         };
+        let Some(range) = range.filter(is_writable) else { return false };
         self.parameters[range].copy_from_slice(bytes);
         true
     }

@@ -39,6 +39,21 @@ fn the_description_is_that_of_the_memory() {
         fields(PARAMETERS_AT, 16),
         ["IdleSpeed 800 rpm", "FanThreshold 90 degC", "TorqueFactor 1", "Program \"CANTAP01\""]
     );
+    assert_eq!(
+        fields(PARAMETERS_AT + 40, 8),
+        [
+            "Cylinder[0].Offset -1 deg",
+            "Cylinder[0].Limits[0] 10 %",
+            "Cylinder[0].Limits[1] 20 %",
+            "Cylinder[1].Offset 1.5 deg",
+            "Cylinder[1].Limits[0] 30 %",
+            "Cylinder[1].Limits[1] 40 %"
+        ]
+    );
+    // Of the map, what is where it is however many points its axes have.
+    let known =
+        ["TorqueMap.NO_AXIS_PTS_X 3", "TorqueMap.NO_AXIS_PTS_Y 2", "TorqueMap.AXIS_PTS_X[0] 1000 rpm"];
+    assert_eq!(fields(PARAMETERS_AT + 16, 4), known);
     for object in description.objects() {
         assert!(ecu.read(0, object.address, object.size()).is_some(), "{}", object.name);
     }

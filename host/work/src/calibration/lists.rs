@@ -1,6 +1,7 @@
 //! Lists of values that the ECU sends by itself.
 
 use anyhow::{Context as _, bail, ensure};
+use cantap_protocols::calibration::ByteOrder;
 use cantap_protocols::ccp::codec as ccp;
 use cantap_protocols::xcp::codec::command;
 
@@ -8,6 +9,14 @@ use super::{MOST_FRAME, Master, refusal};
 
 /// How many lists of a slave are looked at.
 const MOST_CCP_LISTS: u8 = 32;
+/// The same of XCP's, where they are ready.
+const MOST_READY_LISTS: u16 = 64;
+/// Bits of what a list of XCP is like, and of its mode.
+const LIST_PREDEFINED: u8 = 0x01;
+const LIST_EVENT_FIXED: u8 = 0x02;
+const LIST_DAQ: u8 = 0x04;
+const LIST_STIM: u8 = 0x08;
+const LIST_RUNS: u8 = 0x40;
 /// CCP's session status: the lists are set up.
 const CCP_LISTS_READY: u8 = 0x02;
 
@@ -32,36 +41,75 @@ pub struct RunningList {
 }
 
 impl Master<'_> {
-    /// Sets up a list of these values and starts it.
+    /// Sets up a list of these values, a new one or one that the slave has ready, and starts it.
     ///
     /// # Errors
     ///
-    /// The slave does not answer or refuses, has no dynamic lists, or a value is longer than a packet.
+    /// The slave does not answer or refuses, has no list with room for them, or a value is longer than a packet.
     pub fn start_list(&mut self, values: &[Sampled], event: u16) -> anyhow::Result<RunningList> {
         if self.is_ccp() {
             return self.start_ccp_list(values, event);
         }
         let state = self.state()?;
         let info = self.ask(vec![command::GET_DAQ_PROCESSOR_INFO], 0, true)?;
-        let &[properties, _, _, first, second, predefined, key, ..] = &info[..] else {
+        let &[properties, first, second, third, fourth, predefined, key, ..] = &info[..] else {
             bail!("the ECU's answer about its lists has {} bytes; it has to have 7", info.len());
         };
-        ensure!(properties & 1 != 0, "the ECU has only lists that are ready (static); use poll");
         ensure!(key >> 6 == 0, "the ECU identifies its packets in a way that is not supported; use poll");
-        let events = state.order.number(&[first, second]);
+        let events = state.order.number(&[third, fourth]);
         ensure!(
             u64::from(event) < events || events == 0,
             "the ECU has the events 0 to {}",
             events.max(1) - 1
         );
         let has_stamps = properties & 0x10 != 0;
-        let (mut stamp, mut largest) = (0, state.max_dto.min(MOST_FRAME) - 1);
+        let room = state.max_dto.min(MOST_FRAME) - 1;
+        let mut limits = Limits { stamp: 0, room, largest: room, entries: usize::MAX };
         if let Ok(resolution) = self.ask_whether(vec![command::GET_DAQ_RESOLUTION_INFO], 0, true)? {
-            largest = resolution.get(1).map_or(largest, |size| usize::from(*size).min(largest)).max(1);
+            let step = resolution.first().map_or(1, |step| usize::from(*step).max(1));
+            if let Some(value) = values.iter().find(|value| !value.size.is_multiple_of(step)) {
+                bail!(
+                    "{:08X} has {} bytes, and the ECU measures multiples of {step}; poll it",
+                    value.address,
+                    value.size
+                );
+            }
+            limits.largest = resolution.get(1).map_or(room, |size| usize::from(*size).min(room)).max(1);
             let mode = resolution.get(4).copied().unwrap_or_default();
-            stamp = if has_stamps { usize::from(mode & 7) } else { 0 };
+            limits.stamp = if has_stamps { usize::from(mode & 7) } else { 0 };
         }
-        let packets = packets(values, stamp, state.max_dto.min(MOST_FRAME) - 1, largest)?;
+        let (daq, packets) = if properties & 1 == 0 {
+            let lists = state.order.number(&[first, second]) as u16;
+            self.ready_list(values, event, lists, limits)?
+        } else {
+            self.made_list(values, predefined, limits)?
+        };
+        let list = self.number(daq.into(), 2);
+        for (odt, entries) in packets.iter().enumerate() {
+            self.ask([&[command::SET_DAQ_PTR, 0][..], &list, &[odt as u8, 0]].concat(), 0, true)?;
+            for Sampled { extension, address, size } in entries.iter().map(|place| values[*place]) {
+                let address = self.number(address.into(), 4);
+                let size = (size / state.unit) as u8;
+                let command = [&[command::WRITE_DAQ, 0xFF, size, extension][..], &address].concat();
+                self.ask(command, 0, false)?;
+            }
+        }
+        let mode = if limits.stamp > 0 { 0x10 } else { 0 };
+        let event = self.number(event.into(), 2);
+        self.ask([&[command::SET_DAQ_LIST_MODE, mode][..], &list, &event, &[1, 0]].concat(), 0, true)?;
+        self.ask([&[command::START_STOP_DAQ_LIST, 2][..], &list].concat(), 0, true)?;
+        self.ask(vec![command::START_STOP_SYNCH, 1], 0, true)?;
+        Ok(RunningList { daq, packets })
+    }
+
+    /// Makes a list behind those that are ready.
+    fn made_list(
+        &mut self,
+        values: &[Sampled],
+        predefined: u8,
+        limits: Limits,
+    ) -> anyhow::Result<(u16, Vec<Vec<usize>>)> {
+        let packets = packets(values, limits)?;
         let daq = u16::from(predefined);
         let list = self.number(daq.into(), 2);
         self.ask(vec![command::FREE_DAQ], 0, true)?;
@@ -72,20 +120,66 @@ impl Master<'_> {
             let numbers = [odt as u8, entries.len() as u8];
             self.ask([&[command::ALLOC_ODT_ENTRY, 0][..], &list, &numbers].concat(), 0, false)?;
         }
-        for (odt, entries) in packets.iter().enumerate() {
-            self.ask([&[command::SET_DAQ_PTR, 0][..], &list, &[odt as u8, 0]].concat(), 0, true)?;
-            for Sampled { extension, address, size } in entries.iter().map(|place| values[*place]) {
-                let address = self.number(address.into(), 4);
-                let command = [&[command::WRITE_DAQ, 0xFF, size as u8, extension][..], &address].concat();
-                self.ask(command, 0, false)?;
-            }
+        Ok((daq, packets))
+    }
+
+    /// Takes the first of the slave's own (static) lists that has room for these values, sends with this event, and is not in use.
+    fn ready_list(
+        &mut self,
+        values: &[Sampled],
+        event: u16,
+        lists: u16,
+        limits: Limits,
+    ) -> anyhow::Result<(u16, Vec<Vec<usize>>)> {
+        let mut refused = Vec::new();
+        for daq in 0..lists.min(MOST_READY_LISTS) {
+            let list = self.number(daq.into(), 2);
+            let info =
+                match self.ask_whether([&[command::GET_DAQ_LIST_INFO, 0][..], &list].concat(), 0, true)? {
+                    Ok(info) => info,
+                    Err((name, code)) if daq == 0 => {
+                        bail!("the ECU refused {name}: {}", refusal(false, code))
+                    }
+                    Err(_) => break,
+                };
+            let &[properties, odts, entries, low, high, ..] = &info[..] else {
+                bail!("the ECU's answer about list {daq} has {} bytes; it has to have 5", info.len());
+            };
+            let fixed = self.order().unwrap_or(ByteOrder::Little).number(&[low, high]);
+            let kinds = properties & (LIST_DAQ | LIST_STIM);
+            let why = if properties & LIST_PREDEFINED != 0 {
+                "has contents that do not change".to_owned()
+            } else if kinds == LIST_STIM {
+                "is for stimulation".to_owned()
+            } else if properties & LIST_EVENT_FIXED != 0 && fixed != u64::from(event) {
+                format!("has event {fixed}")
+            } else {
+                let limits = Limits { entries: entries.into(), ..limits };
+                match packets(values, limits) {
+                    Ok(packets) if packets.len() <= usize::from(odts) => {
+                        let mode = [&[command::GET_DAQ_LIST_MODE, 0][..], &list].concat();
+                        let mode = self.ask_whether(mode, 0, true)?.ok();
+                        if mode
+                            .and_then(|mode| mode.first().copied())
+                            .is_none_or(|mode| mode & LIST_RUNS == 0)
+                        {
+                            self.ask([&[command::CLEAR_DAQ_LIST, 0][..], &list].concat(), 0, true)?;
+                            return Ok((daq, packets));
+                        }
+                        "is running already".to_owned()
+                    }
+                    Ok(packets) => {
+                        format!("has {odts} packets of {entries} values, and {} are needed", packets.len())
+                    }
+                    Err(error) => error.to_string(),
+                }
+            };
+            refused.push(format!("list {daq} {why}"));
         }
-        let mode = if stamp > 0 { 0x10 } else { 0 };
-        let event = self.number(event.into(), 2);
-        self.ask([&[command::SET_DAQ_LIST_MODE, mode][..], &list, &event, &[1, 0]].concat(), 0, true)?;
-        self.ask([&[command::START_STOP_DAQ_LIST, 2][..], &list].concat(), 0, true)?;
-        self.ask(vec![command::START_STOP_SYNCH, 1], 0, true)?;
-        Ok(RunningList { daq, packets })
+        bail!(
+            "none of the ECU's lists can send this with event {event}: {}; measure less at once, or poll",
+            refused.join(", ")
+        )
     }
 
     /// The same by CCP: in the first of the slave's lists that is large enough.
@@ -98,7 +192,8 @@ impl Master<'_> {
                 "CCP measures 1, 2 or 4 bytes at once, and {address:08X} has {size}; poll it"
             );
         }
-        let packets = packets(values, 0, MOST_FRAME - 1, MOST_FRAME - 1)?;
+        let room = MOST_FRAME - 1;
+        let packets = packets(values, Limits { stamp: 0, room, largest: room, entries: usize::MAX })?;
         let slave = self.options.parties.slave;
         let id = u64::from(slave.raw()) | if slave.is_extended() { 1 << 31 } else { 0 };
         let id = self.number(id, 4);
@@ -152,8 +247,22 @@ impl Master<'_> {
     }
 }
 
+/// What packets have room for, in bytes.
+#[derive(Clone, Copy, Debug)]
+struct Limits {
+    /// A stamp in the first packet.
+    stamp: usize,
+    /// A packet, behind its identifier.
+    room: usize,
+    /// A value.
+    largest: usize,
+    /// Values of a packet, not bytes.
+    entries: usize,
+}
+
 /// Puts values into as few packets as they fit in, in their order.
-fn packets(values: &[Sampled], stamp: usize, room: usize, largest: usize) -> anyhow::Result<Vec<Vec<usize>>> {
+fn packets(values: &[Sampled], limits: Limits) -> anyhow::Result<Vec<Vec<usize>>> {
+    let Limits { stamp, room, largest, entries } = limits;
     let (mut packets, mut left) = (vec![Vec::new()], room.saturating_sub(stamp));
     for (place, value) in values.iter().enumerate() {
         ensure!(
@@ -163,7 +272,7 @@ fn packets(values: &[Sampled], stamp: usize, room: usize, largest: usize) -> any
             value.size,
             room.min(largest)
         );
-        if value.size > left {
+        if value.size > left || packets.last().is_some_and(|packet| packet.len() >= entries) {
             packets.push(Vec::new());
             left = room;
         }
@@ -185,11 +294,17 @@ mod tests {
         sizes.iter().map(|size| Sampled { extension: 0, address: 0, size: *size }).collect()
     }
 
+    fn limits(stamp: usize) -> Limits {
+        Limits { stamp, room: 7, largest: 7, entries: usize::MAX }
+    }
+
     #[test]
     fn values_are_packed_in_their_order() {
-        let packed = packets(&sizes(&[2, 1, 4, 2, 1]), 4, 7, 7).unwrap();
+        let packed = packets(&sizes(&[2, 1, 4, 2, 1]), limits(4)).unwrap();
         assert_eq!(packed, [vec![0, 1], vec![2, 3, 4]]);
-        assert!(packets(&sizes(&[8]), 0, 7, 7).is_err(), "longer than a packet");
-        assert!(packets(&sizes(&[4]), 4, 7, 7).is_err(), "the stamp is there");
+        let packed = packets(&sizes(&[1, 1, 1]), Limits { entries: 2, ..limits(0) }).unwrap();
+        assert_eq!(packed, [vec![0, 1], vec![2]], "no more values than a ready list has room for");
+        assert!(packets(&sizes(&[8]), limits(0)).is_err(), "longer than a packet");
+        assert!(packets(&sizes(&[4]), limits(4)).is_err(), "the stamp is there");
     }
 }

@@ -113,8 +113,8 @@ fn engine(shell: &Shell, toolchain: Toolchain, directory: &Path) -> Result<PathB
     toolchain
         .cargo_for(shell, "build", TARGET, "std,panic_abort", directory)?
         .env("CARGO_TARGET_WASM32_UNKNOWN_UNKNOWN_LINKER", linker(toolchain))
-        // The page has no paths of this machine in it. All browsers that `build.mjs` builds for have SIMD.
-        .env("CARGO_ENCODED_RUSTFLAGS", toolchain.remaps(shell)? + "\x1f-Ctarget-feature=+simd128")
+        // The page has no paths of this machine in it.
+        .env("CARGO_ENCODED_RUSTFLAGS", toolchain.remaps(shell)?)
         // Without the parts that read debug information for backtraces.
         .args(toolchain.std_features())
         .args(["--profile", "web", "-p", "cantap-web-engine"])

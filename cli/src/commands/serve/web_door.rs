@@ -113,7 +113,7 @@ impl WebDoor {
         let about = page::about_devices(boards.addresses(), &options, described, "cantap serve")?;
         let page = page::with(&page::find()?, page::LIVE, &about)?;
         let door = |place: Place| {
-            Ok(Self {
+            anyhow::Ok(Self {
                 address: place.address,
                 #[cfg(feature = "tls")]
                 server: place.server,

@@ -84,18 +84,24 @@ impl FrameBits {
         } else {
             (raw << 7 | remote << 6 | dlc, STANDARD_HEADER_BITS)
         };
-        let data_bits = 8 * frame.data_len() as u32;
-        let data = u128::from(u64::from_be_bytes(frame.padded_data())) >> (64 - data_bits);
-        let message = u128::from(header) << data_bits | data;
-        let message_bits = header_bits + data_bits;
-        let crc = CRC_OF
-            .iter()
-            .zip(message.to_le_bytes())
-            .take(message_bits.div_ceil(8) as usize)
-            .fold(0, |crc, (table, byte)| crc ^ table[usize::from(byte)]);
-        // Everything that is subject to stuffing, the first bit in the top position.
+        let (bytes, len) = (frame.padded_data(), frame.data_len());
+        let message_bits = header_bits + 8 * len as u32;
+        let of_header = CRC_OF[len..].iter().zip(header.to_le_bytes()).take(header_bits.div_ceil(8) as usize);
+        let of_data = CRC_OF[..len].iter().rev().zip(bytes);
+        let crc = of_header.chain(of_data).fold(0, |crc, (table, byte)| crc ^ table[usize::from(byte)]);
+        // Everything that is subject to stuffing, the first bit in the top position: the header, the data, the CRC.
+        let data = u64::from_be_bytes(bytes);
+        let mut high = header << (64 - header_bits) | data >> header_bits;
+        let mut low = data << (64 - header_bits);
+        let crc_on_top = u64::from(crc) << (64 - CRC_BITS);
+        if message_bits < 64 {
+            high |= crc_on_top >> message_bits;
+            low |= crc_on_top << (64 - message_bits);
+        } else {
+            low |= crc_on_top >> (message_bits - 64);
+        }
         let stuffed_bits = message_bits + CRC_BITS;
-        let sequence = (message << CRC_BITS | u128::from(crc)) << (128 - stuffed_bits);
+        let sequence = halves(high, low);
         Self {
             unstuffed: stuffed_bits + TAIL_BITS + INTERMISSION_BITS,
             stuff: count_stuff_bits(sequence, stuffed_bits),
@@ -131,7 +137,7 @@ pub fn bits_on_bus(frame: &Frame) -> u32 {
 fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
     // Bit i of each mask, counted from the top, describes bit i of the sequence.
     let same_as_before = !(sequence ^ sequence >> 1) & !TOP_BIT;
-    let valid = !(u128::MAX >> len);
+    let valid = first_bits(len);
     let four_equal = same_as_before & same_as_before >> 1 & same_as_before >> 2;
     let five_equal = four_equal & same_as_before >> 3 & valid;
     let four_equal_after_a_change = four_equal & !(same_as_before >> 3) & valid;
@@ -147,6 +153,23 @@ fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
 /// The first bit of a sequence.
 const TOP_BIT: u128 = 1 << 127;
 
+// Shifts of 128 bits by a number that only a frame shows are calls in WebAssembly and on a Cortex-M: here, all such shifts are of 64.
+
+const fn halves(high: u64, low: u64) -> u128 {
+    (high as u128) << 64 | low as u128
+}
+
+/// The first bits of a sequence, fewer than 128 of them.
+const fn first_bits(count: u32) -> u128 {
+    if count < 64 { halves(!(u64::MAX >> count), 0) } else { halves(u64::MAX, !(u64::MAX >> (count - 64))) }
+}
+
+/// Whether a bit is set, counted from the top.
+const fn has_bit(sequence: u128, place: u32) -> bool {
+    let half = if place < 64 { (sequence >> 64) as u64 } else { sequence as u64 };
+    half & 1 << 63 >> (place & 63) != 0
+}
+
 /// The next stuff bit comes four bits on if these all repeat the last one; otherwise after the next five equal
 /// bits.
 fn count_one_by_one(five_equal: u128, four_equal_after_a_change: u128) -> u32 {
@@ -155,11 +178,11 @@ fn count_one_by_one(five_equal: u128, four_equal_after_a_change: u128) -> u32 {
     while ahead != 0 {
         let mut place = ahead.leading_zeros();
         count += 1;
-        while four_equal_after_a_change << (place + 4) & TOP_BIT != 0 {
+        while has_bit(four_equal_after_a_change, place + 4) {
             place += 4;
             count += 1;
         }
-        ahead = five_equal & u128::MAX >> (place + 5);
+        ahead = five_equal & !first_bits(place + 5);
     }
     count
 }

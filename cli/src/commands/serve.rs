@@ -42,6 +42,7 @@ use self::way::Way;
 use self::web_door::WebDoor;
 use crate::args;
 use crate::database_args::DatabaseArgs;
+use crate::protocols::ProtocolArgs;
 use crate::stderr;
 use crate::usage_error::usage;
 use cantap_work::boards::Boards;
@@ -147,6 +148,8 @@ pub struct Args {
     webs: Vec<String>,
     #[command(flatten)]
     databases: DatabaseArgs,
+    #[command(flatten)]
+    protocol: ProtocolArgs,
     /// What clients may do, by the names in their certificates: channels, identifiers, frames per second, modes, hours. The file is
     /// described in docs/serve.md, and read again at SIGHUP.
     #[cfg(feature = "tls")]
@@ -225,10 +228,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         &args.tcp_tunnels,
         addresses.len(),
     )?;
-    if let (true, Some(option)) = (args.webs.is_empty(), args.databases.given()) {
+    let for_page = args.databases.given().or_else(|| args.protocol.given());
+    if let (true, Some(option)) = (args.webs.is_empty(), for_page) {
         return Err(usage(format!("{option} is for the page; give --web, too")));
     }
-    let webs = WebDoor::all(&args.webs, &way, &devices, &args.databases)?;
+    let webs = WebDoor::all(&args.webs, &way, &devices, &args.databases, &args.protocol)?;
     if way.scheme() == "tls" && tcp.is_none() && !webs.iter().any(WebDoor::is_encrypted) {
         return Err(usage("--tls is for --tcp, or for --web at an address of the network; give one of them"));
     }

@@ -102,6 +102,22 @@ fn pair_help() -> String {
 }
 
 impl ProtocolArgs {
+    /// The first of the options that was given.
+    pub fn given(&self) -> Option<&'static str> {
+        let DescriptionArgs { sheets, odx, a2l, dsdl } = &self.described;
+        let given = [
+            (!self.pairs.is_empty(), "--pair"),
+            (!self.xcp.is_empty(), "--xcp"),
+            (!self.ccp.is_empty(), "--ccp"),
+            (!self.subjects.is_empty(), "--subject"),
+            (!sheets.is_empty(), "--eds"),
+            (!odx.is_empty(), "--odx"),
+            (!a2l.is_empty(), "--a2l"),
+            (!dsdl.is_empty(), "--dsdl"),
+        ];
+        given.into_iter().find_map(|(is_given, option)| is_given.then_some(option))
+    }
+
     /// All of it, to be put into a page: files, and who talks to whom. What is not understood in them is reported on standard error, unless `quiet`.
     pub fn carried(&self, quiet: bool) -> anyhow::Result<Described> {
         // A page is shown to others: faults belong here.

@@ -219,6 +219,19 @@ fn with_its_own_permission_a_page_sends_and_everybody_can_know() {
     }));
 }
 
+/// What helps to understand the bus reaches the page as it does with `cantap ui`.
+#[test]
+fn the_page_is_told_who_talks_to_whom() {
+    let web = Web::start("-d virtual:load=0 -b 500k --pair 6F1/12:612/F1 --xcp 7F0:7F1 --ccp 123:124", 2);
+    let (_, token) = web.place();
+    let answer = web.get(&format!("/?token={token}"));
+    let expected =
+        json!({ "pairs": ["6F1/12:612/F1"], "xcp": ["7F0:7F1"], "ccp": ["123:124"], "subjects": [] });
+    let (_, told) = answer.split_once("\"connections\":").unwrap_or_else(|| panic!("{answer}"));
+    let told = serde_json::Deserializer::from_str(told).into_iter::<Value>().next();
+    assert_eq!(told.unwrap().unwrap(), expected);
+}
+
 /// The shared board goes and comes back: the server says so, and the page goes on.
 #[test]
 fn a_page_sees_a_board_that_goes_and_comes_back() {
@@ -247,7 +260,11 @@ fn what_cannot_be_is_refused_before_anything_is_shared() {
         ("--web 192.0.2.1:80", 2, "cantap ui -d tls://"),
         ("--web localhost", 2, "is not an address"),
         ("--db car.dbc", 2, "give --web, too"),
+        ("--xcp 7F0:7F1", 2, "--xcp is for the page; give --web, too"),
+        ("--eds drive.eds", 2, "--eds is for the page; give --web, too"),
         ("--web --db none.dbc", 1, "none.dbc"),
+        ("--web --eds none.eds", 1, "none.eds"),
+        ("--web --subject 1620=uavcan.Nothing.1.0", 1, "uavcan.Nothing.1.0"),
         ("--web --allow page:send", 2, "web"),
     ] {
         let mut command =

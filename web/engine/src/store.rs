@@ -192,10 +192,10 @@ impl Block {
         self.device_times.push(self.times.len(), record.moment());
         self.times.push(record.time_ns);
         self.channels.push(record.channel);
-        let (id, kind, data) = match record.event {
-            TraceEvent::Frame { frame, direction, late } => self.pack(&frame, direction, late),
+        let (id, kind, data) = match &record.event {
+            TraceEvent::Frame { frame, direction, late } => self.pack(frame, *direction, *late),
             event => {
-                self.events.push(event);
+                self.events.push(*event);
                 (0, EVENT << 4, (self.events.len() - 1) as u64)
             }
         };

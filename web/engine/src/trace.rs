@@ -74,6 +74,8 @@ enum Feed {
         pieces: Pieces,
         reader: Option<Box<TraceReader>>,
         reserve: u64,
+        /// What the reader has filled last, which it fills again.
+        batch: Vec<TraceRecord>,
     },
     /// Packed records as they come.
     Live,
@@ -233,7 +235,7 @@ impl Trace {
         let feed = if is_live {
             Feed::Live
         } else {
-            Feed::Pieces { pieces: Pieces::default(), reader: None, reserve: RESERVE }
+            Feed::Pieces { pieces: Pieces::default(), reader: None, reserve: RESERVE, batch: Vec::new() }
         };
         let mut content = Content::new(&rates);
         content.keep = is_live.then(|| keep.unwrap_or(KEPT_LIVE));
@@ -274,14 +276,14 @@ impl Trace {
 
     fn read_on(&mut self) -> Result<(), EngineError> {
         loop {
-            let Feed::Pieces { pieces, reader, reserve } = &mut self.feed else { return Ok(()) };
+            let Feed::Pieces { pieces, reader, reserve, batch } = &mut self.feed else { return Ok(()) };
             let is_complete = pieces.is_complete();
             let unread = pieces.received() - pieces.read_so_far();
             if !is_complete && unread < *reserve {
                 return Ok(());
             }
             let more = if let Some(reader) = reader {
-                take_batch(reader, &mut self.content)
+                take_batch(reader, batch, &mut self.content)
             } else {
                 let opened = open_source(&self.name, pieces.clone(), &ReadOptions::default());
                 if !pieces.ran_dry() {
@@ -368,9 +370,8 @@ fn chunks(mut rest: &[u8], content: &mut Content) -> Result<(), EngineError> {
 }
 
 /// Takes the next records, or the next issue; false at the end.
-fn take_batch(reader: &mut TraceReader, content: &mut Content) -> bool {
-    let mut batch = Vec::new();
-    match reader.next_batch(&mut batch) {
+fn take_batch(reader: &mut TraceReader, batch: &mut Vec<TraceRecord>, content: &mut Content) -> bool {
+    match reader.next_batch(batch) {
         Some(Ok(())) => batch.iter().for_each(|record| content.push(record)),
         Some(Err(issue)) => content.issue(issue.to_string()),
         None => return false,

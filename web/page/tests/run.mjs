@@ -18,6 +18,6 @@ const page = value('--page');
 const program = value('--program');
 
 await buildPage({ entry: join(here, 'fake-main.ts'), out: join(here, '../dist/fake.html') });
-const files = ['numbers', 'trace', 'graphs', 'bits', 'views', 'errors', 'report', 'access', 'touch', ...(page ? ['engine', 'delivered'] : []), ...(page && program ? ['truth', 'board', 'live', 'live-attack', 'serve-web', 'serve-tls', 'firefox'] : [])].map((name) => join(here, `${name}.test.mjs`));
+const files = ['numbers', 'trace', 'graphs', 'bits', 'views', 'errors', 'report', 'access', 'touch', ...(page ? ['engine', 'delivered'] : []), ...(page && program ? ['truth', 'board', 'live', 'sleep', 'live-attack', 'serve-web', 'serve-tls', 'firefox'] : [])].map((name) => join(here, `${name}.test.mjs`));
 const { status } = spawnSync(process.execPath, ['--test', '--test-concurrency=1', ...files], { stdio: 'inherit', env: { ...process.env, ...(page ? { CANTAP_TEST_PAGE: page } : {}), ...(program ? { CANTAP_TEST_PROGRAM: program } : {}) } });
 process.exit(status ?? 1);

@@ -20,7 +20,8 @@ use super::doors::{Allowed, Door, address, allow};
 use super::way::Way;
 use crate::commands::ui::DEAD_MAN;
 use crate::database_args::{DatabaseArgs, load};
-use crate::page::{self, Described};
+use crate::page;
+use crate::protocols::ProtocolArgs;
 use crate::stderr;
 use crate::usage_error::usage;
 
@@ -52,28 +53,15 @@ pub enum Serving {
     Encrypted(Option<Listening>, People),
 }
 
-impl WebDoor {
-    /// One for each of these addresses, so that a mistake is known before there is a server.
-    pub fn all(
-        texts: &[String],
-        way: &Way,
-        boards: &Boards,
-        databases: &DatabaseArgs,
-    ) -> anyhow::Result<Vec<Self>> {
-        let doors: Vec<_> =
-            texts.iter().map(|text| Self::new(text, way, boards, databases)).collect::<Result<_, _>>()?;
-        for (at, door) in doors.iter().enumerate() {
-            if door.address.port() != 0 && doors[..at].iter().any(|other| other.address == door.address) {
-                return Err(usage(format!(
-                    "--web is given twice for {}; give each another address or port",
-                    door.address
-                )));
-            }
-        }
-        Ok(doors)
-    }
+/// Where a page will be.
+struct Place {
+    address: SocketAddr,
+    #[cfg(feature = "tls")]
+    server: Option<tls::Server>,
+}
 
-    fn new(text: &str, way: &Way, boards: &Boards, databases: &DatabaseArgs) -> anyhow::Result<Self> {
+impl Place {
+    fn new(text: &str, way: &Way) -> anyhow::Result<Self> {
         let (text, is_https) = text.strip_prefix(HTTPS).map_or((text, false), |text| (text, true));
         let address = address(text, PORT)?;
         let is_encrypted = is_https || !address.ip().is_loopback();
@@ -91,17 +79,49 @@ impl WebDoor {
                  certificate; or on the other computer, use cantap ui -d tls://… or -d ssh://…, or ssh -L {PORT}:127.0.0.1:{PORT}"
             )));
         }
-        let options = databases.or_of(boards.addresses());
-        let decoder = load(&options, false, false)?;
-        let about = page::about_devices(boards.addresses(), &options, Described::default(), "cantap serve")?;
-        let site = Site::new(&page::with(&page::find()?, page::LIVE, &about)?)?;
         Ok(Self {
             address,
             #[cfg(feature = "tls")]
             server,
-            site,
-            databases: decoder,
         })
+    }
+}
+
+impl WebDoor {
+    /// One for each of these addresses, so that a mistake is known before there is a server.
+    pub fn all(
+        texts: &[String],
+        way: &Way,
+        boards: &Boards,
+        databases: &DatabaseArgs,
+        protocol: &ProtocolArgs,
+    ) -> anyhow::Result<Vec<Self>> {
+        let places: Vec<_> = texts.iter().map(|text| Place::new(text, way)).collect::<Result<_, _>>()?;
+        for (at, Place { address, .. }) in places.iter().enumerate() {
+            if address.port() != 0 && places[..at].iter().any(|other| other.address == *address) {
+                return Err(usage(format!(
+                    "--web is given twice for {address}; give each another address or port"
+                )));
+            }
+        }
+        if places.is_empty() {
+            return Ok(Vec::new());
+        }
+        let options = databases.or_of(boards.addresses());
+        let decoder = load(&options, false, false)?;
+        let described = protocol.carried(false)?;
+        let about = page::about_devices(boards.addresses(), &options, described, "cantap serve")?;
+        let page = page::with(&page::find()?, page::LIVE, &about)?;
+        let door = |place: Place| {
+            anyhow::Ok(Self {
+                address: place.address,
+                #[cfg(feature = "tls")]
+                server: place.server,
+                site: Site::new(&page)?,
+                databases: decoder.clone(),
+            })
+        };
+        places.into_iter().map(door).collect()
     }
 
     /// Whether browsers show certificates.

@@ -184,39 +184,39 @@ impl ChannelStatistics {
         if record.event == TraceEvent::GAP {
             self.suspend();
         }
-        match record.event {
+        match &record.event {
             TraceEvent::Frame { frame, direction, late } => {
-                self.frame(&frame, direction, late, record.moment(), closed);
+                self.frame(frame, *direction, *late, record.moment(), closed);
             }
             TraceEvent::BusError { kind, counters } => {
                 match kind {
-                    Some(kind) => self.errors.by_kind[kind as usize] += 1,
+                    Some(kind) => self.errors.by_kind[*kind as usize] += 1,
                     None => self.errors.unknown += 1,
                 }
                 self.counters = counters.or(self.counters);
                 self.windows.errors(1);
             }
             TraceEvent::ErrorsSuppressed { count } => {
-                self.errors.suppressed += u64::from(count);
-                self.windows.errors(u64::from(count));
+                self.errors.suppressed += u64::from(*count);
+                self.windows.errors(u64::from(*count));
             }
             TraceEvent::State { state, counters } => {
-                self.state_changes += u64::from(self.state != Some(state));
-                self.state = Some(state);
+                self.state_changes += u64::from(self.state != Some(*state));
+                self.state = Some(*state);
                 self.counters = counters.or(self.counters);
             }
             TraceEvent::Lost { stage, count, at_least } => {
                 match stage {
-                    Some(stage) => self.losses.by_stage[stage as usize] += u64::from(count),
-                    None => self.losses.unknown += u64::from(count),
+                    Some(stage) => self.losses.by_stage[*stage as usize] += u64::from(*count),
+                    None => self.losses.unknown += u64::from(*count),
                 }
                 self.losses.gaps += 1;
-                self.losses.uncounted += u64::from(count == 0 && at_least);
-                self.losses.at_least |= at_least;
-                self.windows.lost(u64::from(count));
+                self.losses.uncounted += u64::from(*count == 0 && *at_least);
+                self.losses.at_least |= *at_least;
+                self.windows.lost(u64::from(*count));
             }
             TraceEvent::TransmitFailed { reason, .. } => {
-                self.transmit_failures += match reason {
+                self.transmit_failures += match *reason {
                     TransmitFailure::Overtaken { periods } => u64::from(periods),
                     _ => 1,
                 };

@@ -194,6 +194,10 @@ function drawSeries(pen: Pen, series: Series, colour: string, sheet: Sheet, x: S
     pen.dots(points, colour, 3);
     return;
   }
+  if (!series.exact && last - first > (x.end - x.start) / 2) {
+    drawDense(pen, series, colour, sheet.style, [first, last], px, py);
+    return;
+  }
   let previous = NaN;
   for (let i = first; i < last; i++) {
     const at = px(series.time[i] as number);
@@ -215,6 +219,35 @@ function drawSeries(pen: Pen, series: Series, colour: string, sheet: Sheet, x: S
     for (let i = first; i < last; i++) dots.push(px(series.time[i] as number), py(series.last[i] as number));
     pen.dots(dots, colour, 4);
   }
+}
+
+/** Pixels between two columns from which on there is a line between them. */
+const APART = 1.5;
+
+/** Columns about as near as pixels: each is a bar from its smallest to its largest value, and reaches the one before. */
+function drawDense(pen: Pen, series: Series, colour: string, style: Style, [first, last]: [number, number], px: (time: number) => number, py: (value: number) => number): void {
+  const bars: number[] = [];
+  const lines: number[] = [];
+  let [at, exit] = [NaN, NaN];
+  for (let i = first; i < last; i++) {
+    const here = px(series.time[i] as number);
+    const entry = py(series.first[i] as number);
+    let top = py(series.max[i] as number);
+    let bottom = py(series.min[i] as number);
+    const isApart = here - at > APART;
+    if (isApart) lines.push(at, exit, here, style === 'step' ? exit : entry, NaN, NaN);
+    if (i > first && (style === 'step' || !isApart)) {
+      top = Math.min(top, exit);
+      bottom = Math.max(bottom, exit);
+    }
+    // A value that stays is a pixel high.
+    const flat = Math.max(0, 1 - (bottom - top)) / 2;
+    bars.push(here, top - flat, bottom + flat);
+    at = Math.max(here, px(series.end[i] as number));
+    exit = py(series.last[i] as number);
+  }
+  pen.bars(bars, colour);
+  pen.line(lines, colour, 1);
 }
 
 function drawLanes(pen: Pen, sheet: Sheet, x: Scale): void {

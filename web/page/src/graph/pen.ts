@@ -14,6 +14,8 @@ export interface Pen {
   /** x and y in turn; NaN lifts the pen. */
   line(points: readonly number[], colour: string, width: number, dash?: number[]): void;
   dots(points: readonly number[], colour: string, size: number): void;
+  /** Upright lines, a pixel wide: x, top and bottom in turn. Thousands of them take a fraction of the time of a line. */
+  bars(bars: readonly number[], colour: string): void;
   /** `y` is the middle of the text. */
   text(text: string, x: number, y: number, options: TextOptions): void;
   clipped(x: number, y: number, width: number, height: number, draw: () => void): void;
@@ -81,6 +83,14 @@ export class CanvasPen implements Pen {
     for (let i = 0; i + 1 < points.length; i += 2) this.context.fillRect((points[i] as number) - size / 2, (points[i + 1] as number) - size / 2, size, size);
   }
 
+  bars(bars: readonly number[], colour: string): void {
+    this.context.fillStyle = colour;
+    for (let i = 0; i + 2 < bars.length; i += 3) {
+      const top = bars[i + 1] as number;
+      this.context.fillRect((bars[i] as number) - 0.5, top, 1, (bars[i + 2] as number) - top);
+    }
+  }
+
   text(text: string, x: number, y: number, { colour, align = 'left', size = 11, maxWidth }: TextOptions): void {
     const c = this.context;
     c.fillStyle = colour;
@@ -131,6 +141,12 @@ export class SvgPen implements Pen {
     let path = '';
     for (let i = 0; i + 1 < points.length; i += 2) path += `M${n((points[i] as number) - size / 2)} ${n((points[i + 1] as number) - size / 2)}h${size}v${size}h-${size}z`;
     if (path !== '') this.#parts.push(`<path d="${path}" fill="${escape(colour)}"/>`);
+  }
+
+  bars(bars: readonly number[], colour: string): void {
+    const lines: number[] = [];
+    for (let i = 0; i + 2 < bars.length; i += 3) lines.push(bars[i] as number, bars[i + 1] as number, bars[i] as number, bars[i + 2] as number, NaN, NaN);
+    this.line(lines, colour, 1);
   }
 
   text(text: string, x: number, y: number, { colour, align = 'left', size = 11, maxWidth }: TextOptions): void {

@@ -109,6 +109,11 @@ class ShiftedPen implements Pen {
     this.pen.dots(this.#shifted(points), colour, size);
   }
 
+  bars(bars: readonly number[], colour: string): void {
+    const shifted = bars.map((value, i) => (i % 3 === 0 ? value : value + this.dy));
+    this.pen.bars(shifted, colour);
+  }
+
   text(text: string, x: number, y: number, options: Parameters<Pen['text']>[3]): void {
     this.pen.text(text, x, y + this.dy, options);
   }

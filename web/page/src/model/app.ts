@@ -189,18 +189,37 @@ export class App extends Emitter<Topic> {
     if (!again) this.#fitted = true;
     let first = true;
     let read = 0;
+    // The engine is given a piece while it reads the one before, so that it never waits for the page.
+    let under: { answer: Promise<Summary>; bytes: number } | null = null;
+    const taken = async (): Promise<boolean> => {
+      if (!under) return true;
+      const { answer, bytes } = under;
+      under = null;
+      const summary = await answer;
+      if (turn !== this.#opening) return false;
+      read += bytes;
+      this.#take(summary);
+      return true;
+    };
     try {
-      for await (const piece of pieces(file)) {
+      for await (const { bytes, more } of pieces(file)) {
         if (turn !== this.#opening) return;
-        const summary = first
-          ? await this.ask('open', { name: file.name, bytes: piece.bytes, more: piece.more, size: file.size })
-          : await this.ask('append', { bytes: piece.bytes, more: piece.more });
-        if (turn !== this.#opening) return;
-        if (first) this.#forget(again);
-        first = false;
-        read += piece.bytes.length;
-        this.#take(summary);
+        if (first) {
+          const summary = await this.ask('open', { name: file.name, bytes, more, size: file.size });
+          if (turn !== this.#opening) return;
+          this.#forget(again);
+          first = false;
+          read += bytes.length;
+          this.#take(summary);
+          continue;
+        }
+        const answer = this.ask('append', { bytes, more });
+        // It is waited for one piece later, or never, if the one before is refused.
+        answer.catch(() => undefined);
+        if (!(await taken())) return;
+        under = { answer, bytes: bytes.length };
       }
+      if (!(await taken())) return;
     } catch (error) {
       if (first) {
         // Nothing of the new file was taken in. The engine may have let go of the one before: it is read again.

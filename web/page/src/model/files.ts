@@ -1,7 +1,8 @@
 // Files in and out: read by slices, so that a trace never lies in the page's memory as a whole; saved by a link that is clicked.
 
 const FIRST_PIECE = 1 << 20;
-const PIECE = 8 << 20;
+/** A view waits for two of them at most: one that is being read, and one that the engine has been given. */
+const PIECE = 4 << 20;
 
 export interface Piece {
   bytes: Uint8Array;

@@ -196,6 +196,12 @@ impl End {
             Order::Missing(1) => vec!["1 datagram before this one is missing".to_owned()],
             Order::Missing(missing) => vec![format!("{missing} datagrams before this one are missing")],
             Order::Late => vec!["a datagram came late".to_owned()],
+            Order::Anew => {
+                vec![
+                    "its numbers begin anew, or an unknown number of datagrams before this one is missing"
+                        .to_owned(),
+                ]
+            }
             Order::Repeated => return Err("a datagram came twice; what it holds was not sent again"),
         };
         let sends_fd = self.session.as_ref().is_none_or(|session| session.bus.device.hello().sends_fd());

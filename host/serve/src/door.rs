@@ -1,5 +1,5 @@
-//! Where clients of protocols that are not ours connect. All of these doors admit them by the same rules: each client has a place and a thread, and
-//! one that has not said what is needed to be served within [`GREETING_TIMEOUT`] leaves.
+//! Where clients of protocols that are not ours connect. All of these doors admit them by the same rules: each client has a place and a
+//! thread. Each protocol decides what is a greeting; without one, a client leaves after [`GREETING_TIMEOUT`], or the protocol's own time.
 
 use std::io::{self, Read};
 use std::net::{SocketAddr, TcpListener, TcpStream};
@@ -48,8 +48,8 @@ impl Door {
         Ok(Self { listener, places: Places::new(most), kind, address, role })
     }
 
-    /// Has the next client served in a thread of its own, or, without a place for it, turned away. An error: nobody is there, or whoever came has
-    /// gone.
+    /// Has the next client served in a thread of its own, or, without a place for it, turned away. An error: nobody is there, or whoever came
+    /// has gone.
     pub fn admit(
         &self,
         turn_away: impl FnOnce(&mut TcpStream, String, NoPlace),

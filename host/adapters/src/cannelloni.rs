@@ -108,9 +108,9 @@ impl Cannelloni {
         };
         match self.sequence.take(header.sequence, bytes) {
             Order::Next => {}
-            // The other end may have begun anew, with the first number there is: then nobody knows what is missing.
-            Order::Missing(_) if header.sequence == 0 => {
-                self.oddities.count("gaps between datagrams, or new beginnings of the other end");
+            // How many are missing, if any, nobody knows.
+            Order::Anew => {
+                self.oddities.count("long gaps between datagrams, or new beginnings of the other end");
                 self.lost(0, true, at);
             }
             Order::Missing(missing) => {

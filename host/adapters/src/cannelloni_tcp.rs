@@ -46,6 +46,8 @@ impl CannelloniTcp {
         let deadline = Instant::now() + within;
         loop {
             if tunnel.stream.is_greeted().map_err(|_| foreign())? {
+                // What came along with it is taken now, not with the time of what comes next.
+                tunnel.push(&[], Instant::now());
                 return Ok(tunnel);
             }
             let left = deadline.saturating_duration_since(Instant::now());

@@ -211,10 +211,12 @@ pub enum Order {
     Next,
     /// So many before it are missing; each had at least a frame.
     Missing(u8),
-    /// One with a higher number came before, or the sender has begun anew.
+    /// Ones with higher numbers came before, and this one did not.
     Late,
     /// The same datagram came before: the network has doubled it.
     Repeated,
+    /// The sender has begun anew, or more are missing than numbers of eight bits can tell: nobody knows how many, perhaps none.
+    Anew,
 }
 
 /// Datagrams that a network may overtake, or double, with others between. One with a number further back is of a sender that has begun anew.
@@ -239,13 +241,20 @@ impl Sequence {
         let Some(expected) = self.expected.replace(next) else { return Order::Next };
         match (sequence.wrapping_sub(expected), expected.wrapping_sub(sequence)) {
             (0, _) => Order::Next,
+            (1..0x80, _) if sequence == 0 => Order::Anew,
             (missing @ 1..0x80, _) => Order::Missing(missing),
+            // Another one had this number.
+            (_, 1..=OVERTAKEN)
+                if before.is_some_and(|(number, hash)| number == sequence && hash != own.1) =>
+            {
+                Order::Anew
+            }
             (_, 1..=OVERTAKEN) => {
                 // It changes nothing about what is expected.
                 self.expected = Some(expected);
                 if before == Some(own) { Order::Repeated } else { Order::Late }
             }
-            _ => Order::Late,
+            _ => Order::Anew,
         }
     }
 }
@@ -310,7 +319,7 @@ impl Writer {
 
 #[cfg(test)]
 mod tests {
-    use super::Order::{Late, Missing, Next, Repeated};
+    use super::Order::{Anew, Late, Missing, Next, Repeated};
     use super::*;
 
     proptest::proptest! {
@@ -383,12 +392,17 @@ mod tests {
         // The same once more, next to each other and with others between.
         assert_eq!([4, 2, 5].map(|number| take(number, 0)), [Repeated, Repeated, Next]);
         // Another one with a number that was there is none of these: its sender has begun anew.
-        assert_eq!([take(0, 1), take(1, 1), take(2, 1), take(2, 1)], [Late, Late, Late, Repeated]);
-        // So has one that is far back.
-        for number in 6..100 {
+        assert_eq!([take(0, 1), take(1, 1), take(2, 1), take(2, 1)], [Anew, Next, Next, Repeated]);
+        // So has one that is far back, or more are missing than the numbers show: 200 in a row, and 250.
+        for number in 3..100 {
             assert_eq!(take(number, 0), Next);
         }
-        assert_eq!([0, 1, 2].map(|number| take(number, 0)), [Late, Next, Next]);
+        assert_eq!([0, 1, 2].map(|number| take(number, 0)), [Anew, Next, Next]);
+        assert_eq!([203, 204].map(|number| take(number, 0)), [Anew, Next]);
+        assert_eq!((205..=220).map(|number| take(number, 0)).filter(|order| *order != Next).count(), 0);
+        assert_eq!([215, 216].map(|number| take(number, 1)), [Anew, Next]);
+        // Number 0 behind a gap is how a sender begins.
+        assert_eq!([0, 1, 2].map(|number| take(number, 2)), [Anew, Next, Next]);
         // A number is used again every 256 datagrams, with the same content if a sender repeats itself.
         for number in (3..=255).chain(0..=255) {
             assert_eq!(take(number, 0), Next);

@@ -19,6 +19,7 @@ use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
 use crate::connect::SOCKET_TIMEOUT;
+use crate::door::role_at;
 use crate::feed::{self, Feed, Losses, Source};
 use crate::left_out::LOST;
 use crate::listen::Listening;
@@ -53,13 +54,12 @@ pub struct Tunnel {
 /// Opens a tunnel, which begins as soon as the board is there.
 pub fn open(tunnel: Tunnel) -> io::Result<Listening> {
     let Tunnel { board, channel, local, peer, role } = tunnel;
-    let is_local = local.ip().is_loopback() && peer.ip().is_loopback();
+    let role = role_at(peer, role_at(local, role));
     let socket = UdpSocket::bind(local)?;
     socket.connect(peer)?;
     socket.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     let (local, peer) = (socket.local_addr()?, socket.peer_addr()?);
     let name = format!("cannelloni peer {peer}");
-    let role = if is_local { role } else { Role::Listen };
     let mut end = End {
         far: Arc::new(Far { socket, bus: TunnelBus::default() }),
         board,
@@ -196,6 +196,12 @@ impl End {
             Order::Missing(1) => vec!["1 datagram before this one is missing".to_owned()],
             Order::Missing(missing) => vec![format!("{missing} datagrams before this one are missing")],
             Order::Late => vec!["a datagram came late".to_owned()],
+            Order::Anew => {
+                vec![
+                    "its numbers begin anew, or an unknown number of datagrams before this one is missing"
+                        .to_owned(),
+                ]
+            }
             Order::Repeated => return Err("a datagram came twice; what it holds was not sent again"),
         };
         let sends_fd = self.session.as_ref().is_none_or(|session| session.bus.device.hello().sends_fd());

@@ -3,12 +3,11 @@
 //! A client greets first, and until it has, it is sent nothing. The bus is only listened to until a client sends, as with UDP; losses and errors are error
 //! frames. A frame that cannot be ends the connection: what comes behind it could be data that look like a frame, and would be sent.
 
-use std::io::{self, Read};
+use std::io;
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::Instant;
 
 use cantap::device::{is_idle, write_patiently};
 use cantap::{TraceEvent, TraceFrame, TraceRecord};
@@ -16,13 +15,14 @@ use cantap_codecs::cannelloni::{BadStream, GREETING, Stream, put, put_error, put
 use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
+use crate::door::{Door, Visitor};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::LOST;
-use crate::listen::{Listening, accept, bind, patience};
+use crate::listen::{Listening, patience};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
-use crate::places::{GREETING_TIMEOUT, Origin, Place, Places, ends};
+use crate::places::NoPlace;
 use crate::tunnel_bus::{self, Sorted, Told, TunnelBus};
 use crate::writer::took_nothing;
 use crate::{Board, News};
@@ -34,37 +34,26 @@ pub fn listen(
     address: SocketAddr,
     role: Role,
 ) -> io::Result<Listening> {
-    let role = if address.ip().is_loopback() { role } else { Role::Listen };
-    let (listener, address) = bind(address)?;
+    let door = Door::open("cannelloni client", address, role, board.most_clients())?;
     let board = Arc::clone(board);
-    let places = Places::new(board.most_clients());
-    Listening::start("cantap-cannelloni", Some(address), move || {
-        let (stream, peer) = accept(&listener, role)?;
-        let name = format!("cannelloni client {peer}");
-        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
-            Ok(place) => place,
-            Err(full) => {
-                board.tell(News::Refused { client: name, reason: full.to_string() });
-                return Ok(());
-            }
+    Listening::start("cantap-cannelloni", Some(door.address), move || {
+        let (role, of_client) = (door.role, Arc::clone(&board));
+        let turn_away = |_: &mut TcpStream, client: String, full: NoPlace| {
+            board.tell(News::Refused { client, reason: full.to_string() });
         };
-        let board = Arc::clone(&board);
-        std::thread::Builder::new().name("cantap-cannelloni-client".to_owned()).spawn(move || {
-            if let Ok(output) = stream.try_clone() {
-                let connection = Connection {
-                    output: Mutex::new(output),
-                    name,
-                    board,
-                    channel,
-                    role,
-                    bus: TunnelBus::default(),
-                    is_over: AtomicBool::new(false),
-                };
-                Arc::new(connection).serve(stream, &place);
-            }
-            drop(place);
-        })?;
-        Ok(())
+        door.admit(turn_away, move |visitor| {
+            let Ok(output) = visitor.stream.try_clone() else { return };
+            let connection = Connection {
+                output: Mutex::new(output),
+                name: visitor.name.clone(),
+                board: of_client,
+                channel,
+                role,
+                bus: TunnelBus::default(),
+                is_over: AtomicBool::new(false),
+            };
+            Arc::new(connection).serve(visitor);
+        })
     })
 }
 
@@ -87,19 +76,13 @@ struct Session {
 
 impl Connection {
     /// Sends what the client sends until either side ends.
-    fn serve(self: &Arc<Self>, mut input: TcpStream, place: &Place) {
-        let came = Instant::now();
+    fn serve(self: &Arc<Self>, mut visitor: Visitor) {
         let (mut stream, mut session, mut first) = (Stream::default(), None, Vec::new());
         let mut bytes = [0; 4096];
         while !self.is_over() {
-            let len = match input.read(&mut bytes) {
-                Ok(0) => break,
-                Ok(len) => len,
-                Err(error) if is_idle(&error) => 0,
-                Err(_) => break,
-            };
+            let Some(len) = visitor.read(&mut bytes) else { break };
             if len > 0 {
-                place.spoke();
+                visitor.place.spoke();
             }
             stream.push(&bytes[..len]);
             if session.is_none() {
@@ -112,7 +95,7 @@ impl Connection {
                             break;
                         }
                     },
-                    Ok(false) if came.elapsed() > GREETING_TIMEOUT => break,
+                    Ok(false) if visitor.is_late() => break,
                     Ok(false) => continue,
                     Err(_) => {
                         self.refused(foreign::reason(&first));
@@ -121,7 +104,7 @@ impl Connection {
                 }
             }
             let Some(session) = &mut session else { continue };
-            place.is_served();
+            visitor.place.is_served();
             if let Err(BadStream::NoFrame | BadStream::NoGreeting) = self.take(&mut stream, &mut session.bus)
             {
                 self.refused("it sent what is no frame".to_owned());

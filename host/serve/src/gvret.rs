@@ -3,12 +3,11 @@
 //! Frames come once the client has given its first command. A bus is only listened to until the client sends, as with socketcand. The protocol
 //! knows neither errors nor losses nor remote frames: they are counted, and the server says how many it left out.
 
-use std::io::{self, Read};
+use std::io;
 use std::net::{SocketAddr, TcpStream};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
-use std::time::Instant;
 
 use cantap::device::{channel_number, is_idle, write_patiently};
 use cantap::{Device, DeviceError, Direction, TraceEvent, TraceFrame, TraceRecord};
@@ -16,15 +15,16 @@ use cantap_codecs::gvret::{Bus, Command, Message, command};
 use cantap_wire::message::{ChannelConfig, Mode, Role};
 use cantap_wire::{CHANNELS, Channel, Refusal};
 
+use crate::door::{Door, Visitor};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::{LOST, LeftOut};
 use crate::lines::device_of;
-use crate::listen::{Listening, accept, bind, patience};
+use crate::listen::{Listening, patience};
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
 use crate::own_frames::OwnFrames;
-use crate::places::{GREETING_TIMEOUT, Origin, Place, Places, ends};
+use crate::places::NoPlace;
 use crate::text::now_ns;
 use crate::writer::took_nothing;
 use crate::{Board, News};
@@ -39,29 +39,19 @@ pub const MOST_BOARDS: usize = 2;
 /// Admits clients. The buses are the channels of the first two boards. The protocol has no authentication: at an address that is not this
 /// machine's own (loopback), clients may only listen.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {
-    let role = if address.ip().is_loopback() { role } else { Role::Listen };
-    let (listener, address) = bind(address)?;
+    let most = boards.first().map_or(0, |board| board.most_clients());
+    let door = Door::open("GVRET client", address, role, most)?;
     let boards: Arc<[Arc<Board>]> = boards.iter().take(MOST_BOARDS).cloned().collect();
-    let places = Places::new(boards.first().map_or(0, |board| board.most_clients()));
-    Listening::start("cantap-gvret", Some(address), move || {
-        let (stream, peer) = accept(&listener, role)?;
-        let name = format!("GVRET client {peer}");
-        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
-            Ok(place) => place,
-            Err(full) => {
-                boards[0].tell(News::Refused { client: name, reason: full.to_string() });
-                return Ok(());
-            }
+    Listening::start("cantap-gvret", Some(door.address), move || {
+        let (role, of_client) = (door.role, Arc::clone(&boards));
+        let turn_away = |_: &mut TcpStream, client: String, full: NoPlace| {
+            boards[0].tell(News::Refused { client, reason: full.to_string() });
         };
-        let boards = Arc::clone(&boards);
-        std::thread::Builder::new().name("cantap-gvret-client".to_owned()).spawn(move || {
-            if let Ok(output) = stream.try_clone() {
-                let connection = Arc::new(Connection::new(output, name, boards, role));
-                connection.serve(stream, &place);
+        door.admit(turn_away, move |visitor| {
+            if let Ok(output) = visitor.stream.try_clone() {
+                Arc::new(Connection::new(output, visitor.name.clone(), of_client, role)).serve(visitor);
             }
-            drop(place);
-        })?;
-        Ok(())
+        })
     })
 }
 
@@ -92,20 +82,14 @@ impl Connection {
     }
 
     /// Carries out the client's commands until either side ends.
-    fn serve(self: &Arc<Self>, mut input: TcpStream, place: &Place) {
-        let came = Instant::now();
+    fn serve(self: &Arc<Self>, mut visitor: Visitor) {
         let mut session = None;
         let mut pending = Vec::new();
         let mut bytes = [0; 4096];
         while !self.is_over() {
-            let len = match input.read(&mut bytes) {
-                Ok(0) => break,
-                Ok(len) => len,
-                Err(error) if is_idle(&error) => 0,
-                Err(_) => break,
-            };
+            let Some(len) = visitor.read(&mut bytes) else { break };
             if len > 0 {
-                place.spoke();
+                visitor.place.spoke();
             }
             pending.extend_from_slice(&bytes[..len]);
             let mut used = 0;
@@ -120,10 +104,10 @@ impl Connection {
             }
             pending.drain(..used);
             match &mut session {
-                None if came.elapsed() > GREETING_TIMEOUT => break,
+                None if visitor.is_late() => break,
                 None => {}
                 Some(session) => {
-                    place.is_served();
+                    visitor.place.is_served();
                     self.listen_again(session);
                 }
             }

@@ -16,6 +16,7 @@ mod client;
 pub mod connect;
 #[cfg(feature = "dns-sd")]
 pub mod dns_sd;
+mod door;
 mod feed;
 mod flow;
 mod foreign;

@@ -10,11 +10,12 @@ use cantap::{Device, TraceRecord};
 use cantap_wire::message::Role;
 use cantap_wire::{Channel, Refusal};
 
+use crate::door::{Door, Visitor};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::{LOST, LeftOut};
-use crate::listen::{Listening, accept, bind_loopback, turn_away};
-use crate::places::{Origin, Places, ends};
+use crate::listen::{Listening, only_loopback, turn_away};
+use crate::places::NoPlace;
 use crate::writer::PATIENCE;
 use crate::{Board, News};
 
@@ -24,29 +25,23 @@ const HELD_RECORDS: usize = 1 << 16;
 /// Admits clients at an address of this machine (loopback). They receive every channel of the boards whose bit rate is known, with
 /// consecutive numbers as everywhere.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
-    let (listener, address) = bind_loopback(address)?;
+    only_loopback(address)?;
+    let most = boards.first().map_or(0, |board| board.most_clients());
+    let door = Door::open("line reader", address, Role::Listen, most)?;
     let boards = boards.to_vec();
-    let places = Places::new(boards.first().map_or(0, |board| board.most_clients()));
-    Listening::start("cantap-lines", Some(address), move || {
-        let (mut stream, peer) = accept(&listener, Role::Listen)?;
-        let name = format!("line reader {peer}");
-        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
-            Ok(place) => place,
-            Err(full) => {
-                turn_away(&boards[0], &mut stream, name, &full);
-                return Ok(());
-            }
+    Listening::start("cantap-lines", Some(door.address), move || {
+        let of_client = boards.clone();
+        let turn_away = |stream: &mut TcpStream, name: String, full: NoPlace| {
+            turn_away(&boards[0], stream, name, &full);
         };
-        // It need not say anything.
-        place.is_served();
-        let boards = boards.clone();
-        std::thread::Builder::new().name("cantap-lines-client".to_owned()).spawn(move || {
-            if let Err(reason) = serve(&boards, stream, &name) {
-                boards[0].tell(News::Refused { client: name, reason });
+        door.admit(turn_away, move |visitor| {
+            let Visitor { stream, name, place, .. } = visitor;
+            // It need not say anything.
+            place.is_served();
+            if let Err(reason) = serve(&of_client, stream, &name) {
+                of_client[0].tell(News::Refused { client: name, reason });
             }
-            drop(place);
-        })?;
-        Ok(())
+        })
     })
 }
 

@@ -119,7 +119,8 @@ pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> Result<Listening, So
 /// Admits clients, without encryption and authentication: `address` must be one of this machine's own (loopback),
 /// which every user of the machine can reach; [`PermissionDenied`](io::ErrorKind::PermissionDenied) for any other.
 pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Listening> {
-    let (listener, address) = bind_loopback(address)?;
+    only_loopback(address)?;
+    let (listener, address) = bind(address)?;
     let board = Arc::clone(board);
     let places = Places::new(board.most_clients());
     Listening::start("cantap-tcp", Some(address), move || {
@@ -144,12 +145,9 @@ pub(crate) fn turn_away(
     board.tell(News::Refused { client, reason: reason.to_string() });
 }
 
-/// A socket that can only be reached from this machine.
-pub(crate) fn bind_loopback(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
-    if !address.ip().is_loopback() {
-        return Err(io::ErrorKind::PermissionDenied.into());
-    }
-    bind(address)
+/// Refuses an address that can be reached from other machines.
+pub(crate) fn only_loopback(address: SocketAddr) -> io::Result<()> {
+    if address.ip().is_loopback() { Ok(()) } else { Err(io::ErrorKind::PermissionDenied.into()) }
 }
 
 /// A socket at an address: the one that the program was started with, if it is there.

@@ -4,19 +4,19 @@
 //! `localhost`, as its host, and nothing in the answer allows a page of another origin to read it.
 
 use std::fmt::Write as _;
-use std::io::{self, Read, Write as _};
+use std::io::{self, Write as _};
 use std::net::{IpAddr, SocketAddr, TcpStream};
 use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use cantap::device::{channel_number, is_idle, write_patiently};
+use cantap::device::{channel_number, write_patiently};
 use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
 use crate::Board;
 use crate::board_figures::BoardFigures;
-use crate::listen::{Listening, accept, bind};
-use crate::places::{Origin, Places, ends};
+use crate::door::{Door, Visitor};
+use crate::listen::Listening;
 use crate::totals::ChannelTotals;
 
 /// Longest request.
@@ -28,22 +28,18 @@ const MOST_CONNECTIONS: usize = 8;
 
 /// Answers at an address. Whoever reaches it reads it: there is no authentication, and the only names in it are the boards'.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
-    let (listener, address) = bind(address)?;
+    let door = Door::open("metrics reader", address, Role::Listen, MOST_CONNECTIONS)?;
     // A connection does not keep a server that ends from leaving its buses.
     let names = distinct(boards.iter().map(|board| board.name()));
     let boards: Vec<(String, Weak<Board>)> =
         names.into_iter().zip(boards.iter().map(Arc::downgrade)).collect();
-    let places = Places::new(MOST_CONNECTIONS);
-    Listening::start("cantap-metrics", Some(address), move || {
-        let (stream, peer) = accept(&listener, Role::Listen)?;
-        let Ok(place) = places.enter(Origin::of(&stream, peer), ends(&stream)?) else { return Ok(()) };
+    Listening::start("cantap-metrics", Some(door.address), move || {
         let boards = boards.clone();
-        std::thread::Builder::new().name("cantap-metrics-client".to_owned()).spawn(move || {
+        let turn_away = |_: &mut TcpStream, _, _| ();
+        door.admit(turn_away, move |visitor| {
             // Whoever has left needs no answer.
-            let _ = serve(&boards, stream);
-            drop(place);
-        })?;
-        Ok(())
+            let _ = serve(&boards, visitor);
+        })
     })
 }
 
@@ -59,21 +55,16 @@ fn distinct<'n>(names: impl Iterator<Item = &'n str>) -> Vec<String> {
     all
 }
 
-fn serve(boards: &[(String, Weak<Board>)], mut stream: TcpStream) -> io::Result<()> {
-    let deadline = Instant::now() + PATIENCE;
+fn serve(boards: &[(String, Weak<Board>)], mut visitor: Visitor) -> io::Result<()> {
     let mut request = Vec::new();
     let mut bytes = [0; 1024];
     let end = b"\r\n\r\n";
     while !request.windows(end.len()).any(|window| window == end) {
-        if request.len() > MOST_BYTES || Instant::now() >= deadline {
+        if request.len() > MOST_BYTES || visitor.has_been_for(PATIENCE) {
             return Ok(());
         }
-        match stream.read(&mut bytes) {
-            Ok(0) => return Ok(()),
-            Ok(len) => request.extend_from_slice(&bytes[..len]),
-            Err(error) if is_idle(&error) => {}
-            Err(error) => return Err(error),
-        }
+        let Some(len) = visitor.read(&mut bytes) else { return Ok(()) };
+        request.extend_from_slice(&bytes[..len]);
     }
     let (status, body) = match check(&request) {
         Ok(()) => ("200 OK", text(boards)),
@@ -84,8 +75,8 @@ fn serve(boards: &[(String, Weak<Board>)], mut stream: TcpStream) -> io::Result<
          Cache-Control: no-store\r\nX-Content-Type-Options: nosniff\r\nConnection: close\r\n\r\n{body}",
         body.len()
     );
-    write_patiently(&mut stream, answer.as_bytes(), PATIENCE)?;
-    stream.flush()
+    write_patiently(&mut visitor.stream, answer.as_bytes(), PATIENCE)?;
+    visitor.stream.flush()
 }
 
 /// Whether a request is answered; if not, with which status.

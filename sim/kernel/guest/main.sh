@@ -7,6 +7,8 @@
 # shellcheck source=/dev/null
 . /share/settings
 ALL_PARTS="enumeration captures stalls slcan slcan_reports socketcan gs_usb bridge serve disturbances chapter9 suspend hub modem_manager xhci"
+# A program of others, where it is.
+[ ! -x /share/guest/cannelloni ] || ALL_PARTS="$ALL_PARTS cannelloni"
 for part in ${PARTS:-$ALL_PARTS}; do
   echo "--- $part, at $(uptime_s) s"
   # shellcheck source=/dev/null # whichever it is

@@ -197,3 +197,26 @@ fn babbling_and_new_beginnings_lose_nothing_that_is_known_and_invent_nothing() {
         assert!(failures.contains(kind), "{failures}");
     }
 }
+
+/// Numbers of eight bits cannot say how many datagrams a long outage took, but that there was one is never left out.
+#[test]
+fn an_outage_that_the_numbers_cannot_count_is_a_loss_of_unknown_size() {
+    for missing in [1, 127, 128, 200, 239, 240, 255] {
+        let peer = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let listen = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let device = open(&format!("cannelloni://{}?listen={listen}", peer.local_addr().unwrap()));
+        device.join(Channel::Can1, 500_000).unwrap();
+        let send = |number: u8, data: u8| {
+            peer.send_to(&datagram(number, 1, &[(0x100, &[data])]), ("127.0.0.1", listen)).unwrap();
+        };
+        for number in 100..120 {
+            send(number, number);
+        }
+        send(120_u8.wrapping_add(missing), 0xEE);
+        send(121_u8.wrapping_add(missing), 0xFF);
+        let records = until_frame(&device, "100#FF");
+        assert_eq!(frames(&records).len(), 22, "{missing}");
+        let lost = if missing < 128 { missing.into() } else { 0 };
+        assert_eq!(losses(&records), [("link", lost)], "{missing}");
+    }
+}

@@ -12,6 +12,11 @@ const GREETING: &[u8] = b"CANNELLONIv1";
 
 /// A session with an end that greets as it should, and the end.
 fn greeted() -> (cantap::Device, TcpStream) {
+    greeted_with(&[])
+}
+
+/// The same with something right behind the greeting.
+fn greeted_with(more: &'static [u8]) -> (cantap::Device, TcpStream) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("cannelloni:tcp://{}", listener.local_addr().unwrap());
     let far = std::thread::spawn(move || {
@@ -21,7 +26,7 @@ fn greeted() -> (cantap::Device, TcpStream) {
         assert_eq!(greeting, GREETING);
         // In pieces, as TCP may have it.
         stream.write_all(&GREETING[..5]).unwrap();
-        stream.write_all(&GREETING[5..]).unwrap();
+        stream.write_all(&[&GREETING[5..], more].concat()).unwrap();
         stream
     });
     let device = open(&address);
@@ -98,6 +103,17 @@ fn what_does_not_greet_so_is_refused() {
     // Half a greeting, and then nothing.
     let error = open_error(&GREETING[..11], false);
     assert!(matches!(error, OpenError::Foreign { .. }), "{error}");
+}
+
+/// What comes in one piece with the greeting was on the bus before the channel was opened: it does not wait for the next frame, to get its time.
+#[test]
+fn a_frame_right_behind_the_greeting_is_not_kept_for_later() {
+    let (device, mut far) = greeted_with(&[0, 0, 1, 0x23, 1, 0xAA, 0, 0]);
+    device.listen(Channel::Can1, 500_000).unwrap();
+    // Nor is the frame cut that has begun.
+    far.write_all(&[1, 0x24, 0]).unwrap();
+    let records = until_frame(&device, "124#");
+    assert_eq!((frames(&records), losses(&records)), (vec!["124#".to_owned()], vec![]));
 }
 
 /// A length that lies leaves nobody knowing where the next frame begins: no frame is made of what comes then.

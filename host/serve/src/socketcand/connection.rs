@@ -25,7 +25,6 @@ pub struct Bus {
 
 /// One client.
 pub struct Connection {
-    pub input: Mutex<TcpStream>,
     pub output: Mutex<TcpStream>,
     pub name: String,
     pub buses: Arc<[Bus]>,
@@ -37,18 +36,16 @@ pub struct Connection {
 }
 
 impl Connection {
-    pub fn new(stream: TcpStream, name: String, buses: Arc<[Bus]>, role: Role) -> io::Result<Arc<Self>> {
-        let output = Mutex::new(stream.try_clone()?);
-        Ok(Arc::new(Self {
-            input: Mutex::new(stream),
-            output,
+    pub fn new(output: TcpStream, name: String, buses: Arc<[Bus]>, role: Role) -> Arc<Self> {
+        Arc::new(Self {
+            output: Mutex::new(output),
             name,
             buses,
             role,
             hearing: Mutex::default(),
             told_at: Mutex::new(Instant::now()),
             is_over: AtomicBool::new(false),
-        }))
+        })
     }
 
     /// Sends it text. One that takes nothing for too long is let go.

@@ -14,25 +14,26 @@ mod opened;
 mod subscriptions;
 
 use std::collections::HashMap;
-use std::io::{self, Read, Write};
-use std::net::SocketAddr;
+use std::io::{self, Write};
+use std::net::{SocketAddr, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use cantap::device::{channel_number, is_idle};
+use cantap::device::channel_number;
 use cantap_trace::Interface;
 use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Id};
 
 use crate::beacon::{self, Beacon};
+use crate::door::{Door, Visitor};
 use crate::feed::Source;
 use crate::foreign;
 use crate::lines::device_of;
-use crate::listen::{Listening, accept, bind};
+use crate::listen::Listening;
 use crate::lock::lock;
 use crate::open_bus::OpenBus;
-use crate::places::{Origin, Place, Places, ends};
+use crate::places::NoPlace;
 use crate::{Board, News};
 use bus_feed::BusFeed;
 use command::{BadCommand, Command, Finder};
@@ -55,8 +56,7 @@ const MOST_CONNECTIONS: usize = 32;
 /// Admits clients. The buses are the boards' channels, `can0` being the first board's first, as in every trace. The protocol has no
 /// authentication: at an address that is not this machine's own (loopback), clients may only listen.
 pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {
-    let role = if address.ip().is_loopback() { role } else { Role::Listen };
-    let (listener, address) = bind(address)?;
+    let door = Door::open("socketcand client", address, role, MOST_CONNECTIONS)?;
     let buses: Arc<[Bus]> = boards
         .iter()
         .enumerate()
@@ -69,33 +69,24 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Res
         })
         .collect();
     let names: Vec<&str> = buses.iter().map(|bus| bus.name.as_str()).collect();
-    let beacon = Beacon::new(address, boards, &names)?;
+    let beacon = Beacon::new(door.address, boards, &names)?;
     let mut sent: Option<Instant> = None;
-    let places = Places::new(MOST_CONNECTIONS);
-    Listening::start("cantap-socketcand", Some(address), move || {
+    Listening::start("cantap-socketcand", Some(door.address), move || {
         if sent.is_none_or(|sent| sent.elapsed() >= beacon::EVERY) {
             beacon.send();
             sent = Some(Instant::now());
         }
-        let (stream, peer) = accept(&listener, role)?;
-        let name = format!("socketcand client {peer}");
-        let place = match places.enter(Origin::of(&stream, peer), ends(&stream)?) {
-            Ok(place) => place,
-            Err(full) => {
-                let _ = (&stream).write(format!("< error {full} >").as_bytes());
-                buses[0].board.tell(News::Refused { client: name, reason: full.to_string() });
-                return Ok(());
-            }
+        let (role, of_client) = (door.role, Arc::clone(&buses));
+        let turn_away = |stream: &mut TcpStream, client: String, full: NoPlace| {
+            let _ = stream.write(format!("< error {full} >").as_bytes());
+            buses[0].board.tell(News::Refused { client, reason: full.to_string() });
         };
-        let buses = Arc::clone(&buses);
-        std::thread::Builder::new().name("cantap-socketcand-client".to_owned()).spawn(move || {
-            if let Ok(connection) = Connection::new(stream, name, buses, role) {
+        door.admit(turn_away, move |visitor| {
+            if let Ok(output) = visitor.stream.try_clone() {
                 // An error means that the connection is gone.
-                let _ = connection.serve(&place);
+                let _ = Connection::new(output, visitor.name.clone(), of_client, role).serve(visitor);
             }
-            drop(place);
-        })?;
-        Ok(())
+        })
     })
 }
 
@@ -121,25 +112,16 @@ struct Setup {
 impl Connection {
     /// Carries out the client's commands until either side ends. It has its place for itself once it has said what it wants to receive or
     /// send.
-    fn serve(self: &Arc<Self>, place: &Place) -> io::Result<()> {
+    fn serve(self: &Arc<Self>, mut visitor: Visitor) -> io::Result<()> {
         self.write("< hi >")?;
         let mut finder = Finder::default();
         let (mut setup, mut opened) = (Setup::default(), None);
         let mut answered_at = Instant::now();
-        let came = Instant::now();
         let mut bytes = [0; 4096];
         let mut result = Ok(());
         let mut has_spoken = false;
         while result.is_ok() && !self.is_over.load(Ordering::Relaxed) {
-            let len = match lock(&self.input).read(&mut bytes) {
-                Ok(0) => break,
-                Ok(len) => len,
-                Err(error) if is_idle(&error) => 0,
-                Err(error) => {
-                    result = Err(error);
-                    break;
-                }
-            };
+            let Some(len) = visitor.read(&mut bytes) else { break };
             let bytes = &bytes[..len];
             let is_socketcand = finder.push(bytes, |text| {
                 if result.is_err() || self.is_over.load(Ordering::Relaxed) {
@@ -178,13 +160,13 @@ impl Connection {
                 break;
             }
             if has_spoken {
-                place.spoke();
+                visitor.place.spoke();
             }
             if lock(&self.hearing).has_chosen {
-                place.is_served();
+                visitor.place.is_served();
             }
             match &mut opened {
-                None if came.elapsed() > OPEN_TIMEOUT => break,
+                None if visitor.has_been_for(OPEN_TIMEOUT) => break,
                 None => {}
                 Some(bus) => {
                     if let Err(reason) = self.listen_again(bus) {

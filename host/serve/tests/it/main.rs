@@ -4,6 +4,7 @@ mod board;
 mod browser;
 mod cannelloni;
 mod cannelloni_tcp;
+mod doors;
 mod eight_clients;
 mod gvret;
 mod hostile;

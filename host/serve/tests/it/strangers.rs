@@ -75,7 +75,7 @@ pub fn speaks() -> Vec<u8> {
 }
 
 /// What browsers, and other programs at a wrong port, put in front of a body.
-fn headers(body: &[u8]) -> Vec<Vec<u8>> {
+pub fn headers(body: &[u8]) -> Vec<Vec<u8>> {
     let http = |first: &str| {
         format!(
             "{first}Host: 127.0.0.1:29537\r\nOrigin: http://evil.example\r\nContent-Length: {}\r\n\r\n",

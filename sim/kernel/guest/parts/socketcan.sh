@@ -22,6 +22,7 @@ end_capture() {
 }
 # Frames of a candump log, without the DLC of remote frames, and without errors.
 bare_frames() { awk '{ print $3 }' "$1" | grep -v '^2[0-9A-F]\{7\}#' | sed 's/#R.*$/#R/; s/_[0-9A-F]$//'; }
+frames_so_far() { bare_frames capture.log 2> /dev/null | wc -l; }
 # lost_at STAGE: from the capture's summary.
 lost_at() { sed "s/.*\"lost\":{[^}]*\"$1\":\([0-9]*\).*/\1/" capture.json; }
 
@@ -228,6 +229,25 @@ sleep 1
 board dump socketcan
 [ $_code = 0 ] && [ "$(cat /share/socketcan.sent1)" = 123#0102 ]
 verdict $? "socketcan: a frame sent through slcan is on the bus" "$(cat send.txt)"
+
+# Its cable is pulled in the middle of a burst: the interface goes with the board, and what had come is there.
+board mark
+capture_bus
+board play 1 50 mix 200
+until_all 200 frames_so_far
+board unplug
+wait_until has_told "the interface can0 is gone"
+verdict $? "socketcan: slcan, pulled: it is reported, with what to do" "$(grep vanished capture.err)"
+killall ldattach 2> /dev/null
+attach
+ldattach 17 "$PORT"
+wait_until has_interface can0
+iproute2 link set can0 type can bitrate 500000 && ip link set can0 up
+wait_until has_told "the device is back after" && wait_until is_bound 1
+board play 1 50 mix 100
+until_all 300 frames_so_far
+end_capture 0 && grep -q '"gaps":{"count":1,' capture.json
+verdict $? "socketcan: slcan, back: the capture goes on, and has the gap" "$(frames_so_far) of 300"
 ip link set can0 down
 killall ldattach
 sleep 1

@@ -180,7 +180,6 @@ impl<'m> Loader<'m> {
         let record = self.record(&from.deposit).map(Arc::new);
         let number = from.number.as_ref().map(|number| u32::from(number.number));
         let mut most = match from.characteristic_type {
-            CharacteristicType::Value => Vec::new(),
             CharacteristicType::Ascii => {
                 vec![product(from.matrix_dim.as_ref()).or(number).unwrap_or(1).max(1)]
             }

@@ -130,7 +130,7 @@ impl<'m> Walk<'m> {
                 measurement.byte_order.clone_from(&one.byte_order);
                 measurement.phys_unit.clone_from(&one.phys_unit);
                 measurement.matrix_dim = one.matrix_dim.clone().or_else(|| spot.dimensions.cloned());
-                measurement.layout = one.layout.clone();
+                measurement.layout.clone_from(&one.layout);
                 if !is_array && spot.mode != IndexMode::RowDir {
                     measurement.layout = Some(a2lfile::Layout::new(spot.mode));
                 }

@@ -15,7 +15,7 @@ use cantap_codecs::cannelloni::{BadStream, GREETING, Stream, put, put_error, put
 use cantap_wire::Channel;
 use cantap_wire::message::Role;
 
-use crate::door::{Door, Visitor};
+use crate::door::{AdmittedClient, Door};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::LOST;
@@ -76,7 +76,7 @@ struct Session {
 
 impl Connection {
     /// Sends what the client sends until either side ends.
-    fn serve(self: &Arc<Self>, mut visitor: Visitor) {
+    fn serve(self: &Arc<Self>, mut visitor: AdmittedClient) {
         let (mut stream, mut session, mut first) = (Stream::default(), None, Vec::new());
         let mut bytes = [0; 4096];
         while !self.is_over() {

@@ -25,7 +25,7 @@ pub struct Door {
 }
 
 /// A client that has got a place.
-pub struct Visitor {
+pub struct AdmittedClient {
     /// Its connection.
     pub stream: TcpStream,
     /// Its name in messages.
@@ -53,13 +53,13 @@ impl Door {
     pub fn admit(
         &self,
         turn_away: impl FnOnce(&mut TcpStream, String, NoPlace),
-        serve: impl FnOnce(Visitor) + Send + 'static,
+        serve: impl FnOnce(AdmittedClient) + Send + 'static,
     ) -> io::Result<()> {
         let (mut stream, peer) = accept(&self.listener, self.role)?;
         let name = format!("{} {peer}", self.kind);
         match self.places.enter(Origin::of(&stream, peer), ends(&stream)?) {
             Ok(place) => {
-                let visitor = Visitor { stream, name, place, came: Instant::now() };
+                let visitor = AdmittedClient { stream, name, place, came: Instant::now() };
                 let thread = std::thread::Builder::new().name("cantap-client".to_owned());
                 thread.spawn(move || serve(visitor)).map(drop)
             }
@@ -71,7 +71,7 @@ impl Door {
     }
 }
 
-impl Visitor {
+impl AdmittedClient {
     /// Takes what it has sent: how many bytes, 0 if there are none yet; `None` if it has gone.
     pub fn read(&mut self, bytes: &mut [u8]) -> Option<usize> {
         match self.stream.read(bytes) {

@@ -15,7 +15,7 @@ use cantap_codecs::gvret::{Bus, Command, Message, command};
 use cantap_wire::message::{ChannelConfig, Mode, Role};
 use cantap_wire::{CHANNELS, Channel, Refusal};
 
-use crate::door::{Door, Visitor};
+use crate::door::{AdmittedClient, Door};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::{LOST, LeftOut};
@@ -82,7 +82,7 @@ impl Connection {
     }
 
     /// Carries out the client's commands until either side ends.
-    fn serve(self: &Arc<Self>, mut visitor: Visitor) {
+    fn serve(self: &Arc<Self>, mut visitor: AdmittedClient) {
         let mut session = None;
         let mut pending = Vec::new();
         let mut bytes = [0; 4096];

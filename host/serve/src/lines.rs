@@ -10,7 +10,7 @@ use cantap::{Device, TraceRecord};
 use cantap_wire::message::Role;
 use cantap_wire::{Channel, Refusal};
 
-use crate::door::{Door, Visitor};
+use crate::door::{AdmittedClient, Door};
 use crate::feed::{self, Feed, Losses, Source};
 use crate::foreign;
 use crate::left_out::{LOST, LeftOut};
@@ -35,7 +35,7 @@ pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listenin
             turn_away(&boards[0], stream, name, &full);
         };
         door.admit(turn_away, move |visitor| {
-            let Visitor { stream, name, place, .. } = visitor;
+            let AdmittedClient { stream, name, place, .. } = visitor;
             // It need not say anything.
             place.is_served();
             if let Err(reason) = serve(&of_client, stream, &name) {

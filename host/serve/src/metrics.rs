@@ -15,7 +15,7 @@ use cantap_wire::message::Role;
 
 use crate::Board;
 use crate::board_figures::BoardFigures;
-use crate::door::{Door, Visitor};
+use crate::door::{AdmittedClient, Door};
 use crate::listen::Listening;
 use crate::totals::ChannelTotals;
 
@@ -55,7 +55,7 @@ fn distinct<'n>(names: impl Iterator<Item = &'n str>) -> Vec<String> {
     all
 }
 
-fn serve(boards: &[(String, Weak<Board>)], mut visitor: Visitor) -> io::Result<()> {
+fn serve(boards: &[(String, Weak<Board>)], mut visitor: AdmittedClient) -> io::Result<()> {
     let mut request = Vec::new();
     let mut bytes = [0; 1024];
     let end = b"\r\n\r\n";

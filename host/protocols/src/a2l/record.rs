@@ -31,7 +31,7 @@ struct Part {
 
 /// Numbers of one type in a record.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
+pub struct Location {
     /// Bytes from the record's beginning.
     pub offset: u32,
     /// How each number is stored.
@@ -192,7 +192,7 @@ impl Record {
     /// # Errors
     ///
     /// It is not there, or it is not known where.
-    pub fn place(&self, role: Role, counts: &[u32], most: &[u32]) -> Result<Place, &'static str> {
+    pub fn place(&self, role: Role, counts: &[u32], most: &[u32]) -> Result<Location, &'static str> {
         let mut place = self.without_gaps(role, counts)?;
         if self.is_static {
             let fixed = self.without_gaps(role, most)?;
@@ -206,7 +206,7 @@ impl Record {
         Ok(place)
     }
 
-    fn without_gaps(&self, role: Role, counts: &[u32]) -> Result<Place, &'static str> {
+    fn without_gaps(&self, role: Role, counts: &[u32]) -> Result<Location, &'static str> {
         const TOO_LARGE: &str = "it is too large";
         if let Some(unclear) = self.unclear {
             return Err(unclear);
@@ -236,7 +236,7 @@ impl Record {
                 if role == Role::Points(axis) {
                     let count = counts.get(axis).copied().unwrap_or(1);
                     let dimensions = vec![Dimension { count, stride: group, is_reversed }];
-                    return Ok(Place { offset, data_type: part.data_type, dimensions });
+                    return Ok(Location { offset, data_type: part.data_type, dimensions });
                 }
                 if role == Role::Values {
                     let dimension = |(at, count): (usize, &u32)| Dimension {
@@ -245,7 +245,7 @@ impl Record {
                         is_reversed: false,
                     };
                     let dimensions = counts.iter().enumerate().map(dimension).collect();
-                    return Ok(Place { offset: offset + size, data_type: next.data_type, dimensions });
+                    return Ok(Location { offset: offset + size, data_type: next.data_type, dimensions });
                 }
                 parts.next();
                 let count = counts.get(axis).copied().unwrap_or(1);
@@ -273,7 +273,7 @@ impl Record {
                 PartKind::Values(_) => return Err("the order of its values is not understood"),
             };
             if found == Some(role) {
-                return Ok(Place { offset, data_type: part.data_type, dimensions });
+                return Ok(Location { offset, data_type: part.data_type, dimensions });
             }
             let count = dimensions.iter().try_fold(1_u32, |all, one| all.checked_mul(one.count));
             let used = count.and_then(|count| count.checked_mul(size)).ok_or(TOO_LARGE)?;

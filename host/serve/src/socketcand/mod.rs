@@ -26,7 +26,7 @@ use cantap_wire::message::{Mode, Role};
 use cantap_wire::{Channel, Id};
 
 use crate::beacon::{self, Beacon};
-use crate::door::{Door, Visitor};
+use crate::door::{AdmittedClient, Door};
 use crate::feed::Source;
 use crate::foreign;
 use crate::lines::device_of;
@@ -112,7 +112,7 @@ struct Setup {
 impl Connection {
     /// Carries out the client's commands until either side ends. It has its place for itself once it has said what it wants to receive or
     /// send.
-    fn serve(self: &Arc<Self>, mut visitor: Visitor) -> io::Result<()> {
+    fn serve(self: &Arc<Self>, mut visitor: AdmittedClient) -> io::Result<()> {
         self.write("< hi >")?;
         let mut finder = Finder::default();
         let (mut setup, mut opened) = (Setup::default(), None);

@@ -63,6 +63,10 @@ pub(super) struct Part {
     pub next: Option<Item>,
     /// Where reading was before it, if nothing waited there; among those put in order, its number.
     pub(super) before: Option<Cursor>,
+    /// The same where only one record was read since, at once: its beginning and its group.
+    pub(super) step_back: Option<(u64, usize)>,
+    /// The number of the last record's group, as records have it, and its place.
+    last_id: Option<(u64, usize)>,
     pub(super) next_number: Option<u64>,
     pub(super) ended: bool,
     /// The group of the last record.
@@ -159,6 +163,8 @@ impl Part {
             time_ns: start_ns,
             next: None,
             before: None,
+            step_back: None,
+            last_id: None,
             next_number: None,
             ended: false,
             group: 0,
@@ -184,6 +190,9 @@ impl Part {
     /// What comes next, in the order of time.
     pub fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
         let Some(mut order) = self.order.take() else {
+            if let Some(item) = self.complete(file) {
+                return Ok(Some(item));
+            }
             self.remember();
             return self.read(file);
         };
@@ -200,8 +209,37 @@ impl Part {
     /// Reads what comes next in the file, and puts it in order.
     pub(super) fn put_next(&mut self, order: &mut Order, file: &mut Whole) -> io::Result<()> {
         self.mark(order);
-        order.put(self.read(file)?, self.group);
+        let item = match self.complete(file) {
+            None => self.read(file)?,
+            item => item,
+        };
+        order.put(item, self.group);
         Ok(())
+    }
+
+    /// The next record, if nothing waits and it says everything: by far the most frequent case. Otherwise nothing has happened.
+    fn complete(&mut self, file: &mut Whole) -> Option<Item> {
+        self.step_back = None;
+        if self.ended || !self.waiting.is_empty() {
+            return None;
+        }
+        let before = self.at;
+        let group = self.group(file).ok().flatten();
+        let begin = self.at;
+        self.at = before;
+        let group = group?;
+        let Content::Bus(bus) = &self.groups[group].content else { return None };
+        if !bus.is_complete {
+            return None;
+        }
+        let (len, number) = (self.record_bytes[group], self.counts[group]);
+        let record = self.stream.at(file, begin, len).ok().flatten()?;
+        self.at = begin + len as u64;
+        self.counts[group] += 1;
+        self.group = group;
+        self.step_back = Some((before, group));
+        let row = Row { record, number, apart: &[], invalid: &[] };
+        Some(Item::of(bus.record(&row, record, self.start_ns), before))
     }
 
     /// What comes next in the file.
@@ -247,18 +285,6 @@ impl Part {
                     if let Some(values) = self.values.get_mut(&self.groups[group].address) {
                         values.keep(value, self.by_order);
                     }
-                }
-                // Nothing is waiting, and the record is complete: by far the most frequent case.
-                Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete => {
-                    let (len, number) = (self.record_bytes[group], self.counts[group]);
-                    let Some(record) = self.stream.at(file, self.at, len)? else {
-                        return Ok(Some(self.cut()));
-                    };
-                    self.at += len as u64;
-                    self.counts[group] += 1;
-                    self.group = group;
-                    let row = Row { record, number, apart: &[], invalid: &[] };
-                    return Ok(Some(Item::of(bus.record(&row, record, self.start_ns), place)));
                 }
                 Content::Signals | Content::Times | Content::Other(_) | Content::Bus(_) => {
                     let len = self.record_bytes[group];
@@ -399,9 +425,16 @@ impl Part {
         let Some(id) = self.stream.at(file, self.at, self.id_bytes)? else { return Ok(None) };
         let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
         self.at += self.id_bytes as u64;
+        // Records of one group follow each other.
+        if let Some((last, group)) = self.last_id
+            && last == id
+        {
+            return Ok(Some(group));
+        }
         let group = self.by_id.get(&id).copied();
         let group =
             group.ok_or_else(|| Fault::malformed("a record of a known group", id.to_string().as_bytes()))?;
+        self.last_id = Some((id, group));
         Ok(Some(group))
     }
 

@@ -66,7 +66,13 @@ impl Part {
             let ahead = order.ahead(&mark.known, self.next_number);
             return Some(SavedPart { cursor: mark.cursor.clone(), time_ns, ahead: Some(ahead) });
         }
-        let cursor = if self.next.is_some() {
+        let cursor = if let Some((at, group)) = self.step_back {
+            let mut cursor = Cursor::default();
+            self.cursor(&mut cursor).then_some(())?;
+            cursor.at = at;
+            cursor.counts[group] -= 1;
+            cursor
+        } else if self.next.is_some() {
             self.before.clone()?
         } else {
             let mut cursor = Cursor::default();

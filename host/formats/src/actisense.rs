@@ -32,7 +32,8 @@ const NS_PER_MS: i64 = NS_PER_S / 1000;
 
 const TO_GATEWAY: &str = "messages to a gateway, which sends them with an address of its own";
 const OTHER_TAGS: &str = "tags of another kind than times, directions and messages";
-const OTHER_BYTES: &str = "runs of bytes between messages, such as texts of a gateway";
+const REST: &str = "the rest of a message that began before the file";
+const TEXTS: &str = "texts of a gateway between its messages";
 const NO_DATE: &str = "there is no date: times are the gateway's stamps";
 const SHORT_CLOCK: &str =
     "stamps begin again in less than a second: pauses that are longer look shorter by as much";
@@ -317,6 +318,8 @@ impl Clock {
 #[derive(Default)]
 pub(crate) struct Decoder {
     has_tags: Option<bool>,
+    /// There was a tag or a message.
+    has_begun: bool,
     clock: Clock,
     is_sent: bool,
     noted: Vec<&'static str>,
@@ -428,8 +431,12 @@ impl Decode for Decoder {
             }
             let bytes = input.buffered();
             let (len, found) = match part(bytes, has_tags) {
-                Part::Tag { len, content } => (len, self.tag(&content, place)),
+                Part::Tag { len, content } => {
+                    self.has_begun = true;
+                    (len, self.tag(&content, place))
+                }
                 Part::Message { len, bytes: message } => {
+                    self.has_begun = true;
                     let found = self.message(Bst::of(&message), place, &message);
                     // They are about what follows.
                     if has_tags {
@@ -440,7 +447,16 @@ impl Decode for Decoder {
                     }
                     (len, Some(found))
                 }
-                Part::Other { len } => (len, Some(Found::LeftOut(OTHER_BYTES))),
+                Part::Other { len } => {
+                    let other = &bytes[..len];
+                    let is_text = |byte: &u8| matches!(byte, b' '..=b'~' | b'\t' | b'\r' | b'\n');
+                    let found = match self.has_begun {
+                        true if other.iter().all(is_text) => Found::LeftOut(TEXTS),
+                        false if other.ends_with(&[DLE, ETX]) => Found::LeftOut(REST),
+                        _ => Found::Issue(place, Fault::malformed(EXPECTED, other)),
+                    };
+                    (len, Some(found))
+                }
                 Part::Broken { len } => {
                     (len, Some(Found::Issue(place, Fault::malformed(EXPECTED, &bytes[..len]))))
                 }

@@ -83,12 +83,15 @@ impl BulkOut {
     }
 
     /// Whether packets for it can be in the FIFO: it is in use, or was when its transfer was armed.
-    pub const fn can_receive(&self) -> bool {
+    const fn can_receive(&self) -> bool {
         self.active || self.armed && !self.muted
     }
 
-    /// A packet is in the FIFO.
-    pub fn take_packet(&mut self, registers: &Registers, len: usize) {
+    /// A packet is in the FIFO. Returns whether there can be one.
+    pub fn take_packet(&mut self, registers: &Registers, len: usize) -> bool {
+        if !self.can_receive() {
+            return false;
+        }
         match self.packets.get_mut(self.taken) {
             Some(packet) => {
                 fifo::pop(registers, len, packet);
@@ -98,11 +101,14 @@ impl BulkOut {
             // Cannot happen: no more are let in than there is room for.
             None => fifo::pop(registers, len, &mut []),
         }
+        true
     }
 
-    /// The transfer has ended: it is full, or its last packet was short.
-    pub fn transfer_done(&mut self) {
+    /// The transfer has ended: it is full, or its last packet was short. Returns whether there can have been one.
+    pub const fn transfer_done(&mut self) -> bool {
+        let can_receive = self.can_receive();
         self.armed = false;
+        can_receive
     }
 
     /// Takes a packet and returns its length.

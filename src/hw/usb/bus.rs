@@ -246,42 +246,47 @@ impl Core {
     /// Controllers of this family have been seen to deliver words that cannot be (libopencm3, issue 672; Klipper drops them, too). Only
     /// what fits this device is believed; of anything else, the word is dropped and counted, and no data is read for it.
     fn receive(&mut self) -> u16 {
-        let Self { registers, control, bulk_out, .. } = self;
         let mut bulk = 0;
         for _ in 0..WORDS_PER_POLL {
-            if registers.read(GINTSTS) & gint::RXFLVL == 0 {
+            if self.registers.read(GINTSTS) & gint::RXFLVL == 0 {
                 break;
             }
-            let status = registers.read(GRXSTSP);
-            let number = (status & 0xF) as usize;
-            let len = (status >> 4 & 0x7FF) as usize;
-            let believed = match (status >> 17 & 0xF, number) {
-                (pktsts::SETUP_DATA, 0) if len == 8 => {
-                    control.take_setup(registers, len);
-                    true
-                }
-                (pktsts::SETUP_COMPLETE, 0) => control.setup_done(registers),
-                (pktsts::OUT_DATA, 0) if len <= PACKET => {
-                    control.take_packet(registers, len);
-                    true
-                }
-                (pktsts::OUT_COMPLETE, 0) => control.packet_done(),
-                (pktsts::OUT_DATA, BULK_OUT) if len <= PACKET && bulk_out.can_receive() => {
-                    bulk_out.take_packet(registers, len);
-                    bulk = 1 << BULK_OUT;
-                    true
-                }
-                (pktsts::OUT_COMPLETE, BULK_OUT) if bulk_out.can_receive() => {
-                    bulk_out.transfer_done();
-                    true
-                }
-                _ => false,
-            };
-            if !believed {
-                self.words_dropped = self.words_dropped.wrapping_add(1);
-            }
+            bulk |= self.take_word();
         }
-        bulk_out.arm(registers);
+        self.bulk_out.arm(&mut self.registers);
+        bulk
+    }
+
+    /// Takes a word of the receive FIFO, and what belongs to it. Most interrupts are for packets to the host and find none, so that this is kept out
+    /// of their way.
+    #[inline(never)]
+    fn take_word(&mut self) -> u16 {
+        let Self { registers, control, bulk_out, .. } = self;
+        let mut bulk = 0;
+        let status = registers.read(GRXSTSP);
+        let number = (status & 0xF) as usize;
+        let len = (status >> 4 & 0x7FF) as usize;
+        let believed = match (status >> 17 & 0xF, number) {
+            (pktsts::SETUP_DATA, 0) if len == 8 => {
+                control.take_setup(registers, len);
+                true
+            }
+            (pktsts::SETUP_COMPLETE, 0) => control.setup_done(registers),
+            (pktsts::OUT_DATA, 0) if len <= PACKET => {
+                control.take_packet(registers, len);
+                true
+            }
+            (pktsts::OUT_COMPLETE, 0) => control.packet_done(),
+            (pktsts::OUT_DATA, BULK_OUT) if len <= PACKET => {
+                bulk = 1 << BULK_OUT;
+                bulk_out.take_packet(registers, len)
+            }
+            (pktsts::OUT_COMPLETE, BULK_OUT) => bulk_out.transfer_done(),
+            _ => false,
+        };
+        if !believed {
+            self.words_dropped = self.words_dropped.wrapping_add(1);
+        }
         bulk
     }
 

@@ -382,17 +382,24 @@ fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
 }
 
 /// dumpcap discards what it has no room for when it captures from several interfaces, which depends on what else the computer does. It
-/// counts that, and nothing else may be missing.
+/// counts that, and nothing else may be missing. On a busy computer it has been seen to abort at its start, with several interfaces only: then once more.
 #[test]
 fn tshark_captures_two_devices_at_once_and_only_what_it_counts_is_missing() {
     let _turn = cantap_testing::process::turn();
     let Some(tshark) = Tshark::install() else { return };
     let second: Vec<&str> =
         ["-i", "cantap-virtual", "-o", "extcap.cantap_virtual.bitrate1:1M", "-a", "duration:3"].to_vec();
-    let child = tshark.capture("virtual:load=100,frames=std0", &[&AT_1M[..], &second].concat());
-    let (code, _, err) = said(&child.wait_with_output().unwrap());
+    let capture = || {
+        let child = tshark.capture("virtual:load=100,frames=std0", &[&AT_1M[..], &second].concat());
+        let (code, _, err) = said(&child.wait_with_output().unwrap());
+        tshark.leaves_nothing_behind();
+        (code, err)
+    };
+    let (mut code, mut err) = capture();
+    if err.contains("Child dumpcap process died: Abort") {
+        (code, err) = capture();
+    }
     assert_eq!(code, Some(0), "{err}");
-    tshark.leaves_nothing_behind();
     let numbers = |what: &str| {
         let lines = err.lines().filter(|line| line.contains(what));
         lines.filter_map(|line| line.split(' ').next()?.parse::<usize>().ok()).sum::<usize>()

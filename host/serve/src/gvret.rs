@@ -319,6 +319,7 @@ impl Connection {
     fn put(&self, board: usize, record: &TraceRecord, out: &mut Vec<u8>) {
         let Some(channel) = Channel::from_number(record.channel) else { return };
         let number = usize::from(channel_number(board, channel)) - 1;
+        lock(&self.own[number]).event(&record.event);
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
                 if *direction == Direction::Tx && lock(&self.own[number]).take(*frame) {
@@ -334,8 +335,7 @@ impl Connection {
                 let stamp_us = stamp_us(record.time_ns);
                 Message::Frame { stamp_us, bus: number as u8, frame: *frame }.put(out);
             }
-            TraceEvent::TransmitFailed { tag, .. } => {
-                lock(&self.own[number]).failed(*tag);
+            TraceEvent::TransmitFailed { .. } => {
                 lock(&self.left_out).count("failed transmissions", 1);
             }
             event if *event == TraceEvent::UNCOUNTED => {

@@ -94,9 +94,7 @@ impl TunnelBus {
                 (!is_own).then_some(Told::Frame(frame))
             }
             event => {
-                if let TraceEvent::TransmitFailed { tag, .. } = event {
-                    lock(&self.own).failed(*tag);
-                }
+                lock(&self.own).event(event);
                 error_frame(event).map(|(id, data)| Told::Error(id, data))
             }
         }

@@ -116,9 +116,7 @@ impl Hearing {
                 }
             }
             event => {
-                if let TraceEvent::TransmitFailed { tag, .. } = event {
-                    self.own.failed(*tag);
-                }
+                self.own.event(event);
                 if self.tells_errors() {
                     put_error(out, time_ns, event);
                 }

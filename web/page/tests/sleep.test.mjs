@@ -60,18 +60,33 @@ test('a browser that slept has every record afterwards, and so has the recording
   }
 });
 
-test('a page that the browser freezes in the background goes on where it was', async () => {
+test('a page that stands still goes on where it was', async () => {
   const server = await serve(['-d', 'virtual:car']);
   try {
     const [page, other] = [await newPage({ url: server.url }), await newPage({ url: server.url })];
     for (const each of [page, other]) await each.locator('.shell').waitFor();
     await untilReceived(page, 100);
     const browser = await page.context().newCDPSession(page);
-    await page.evaluate(() => document.addEventListener('freeze', () => (window.hasFrozen = true)));
-    await browser.send('Page.setWebLifecycleState', { state: 'frozen' });
+    await page.evaluate(() => {
+      let last = performance.now();
+      window.longestPause = 0;
+      setInterval(() => {
+        window.longestPause = Math.max(window.longestPause, performance.now() - last);
+        last = performance.now();
+      }, 10);
+    });
+    await browser.send('Debugger.enable');
+    await browser.send('Debugger.pause');
+    const stoodAt = performance.now();
     await untilReceived(other, (await received(other)) + 2000);
-    await browser.send('Page.setWebLifecycleState', { state: 'active' });
-    assert.equal(await page.evaluate(() => window.hasFrozen), true);
+    const stoodMs = performance.now() - stoodAt;
+    await browser.send('Debugger.resume');
+    await browser.send('Debugger.disable');
+    const pause = await page.evaluate(async () => {
+      await new Promise((done) => setTimeout(done, 200));
+      return window.longestPause;
+    });
+    assert.ok(pause > stoodMs / 2, `it stood still for ${pause} of ${stoodMs} ms`);
     await untilReceived(page, await received(other));
     await untilText(page, '.live-state', 'live');
     await everyRecordOnce(page);
